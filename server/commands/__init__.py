@@ -1,0 +1,1 @@
+"""One module a command of `gyrobench`: `add(parser)` and `main(args) -> int`."""

@@ -1,0 +1,1 @@
+"""The rigs: a small protocol for tables and DAQs, and what implements it."""
