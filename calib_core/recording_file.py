@@ -1,0 +1,262 @@
+"""Recordings from and to bytes: CSV and gzipped CSV here, Parquet next door.
+
+pyarrow reads the good file fast; whatever it refuses is read again row by row in Python, which is slow, forgiving
+about spaces, and knows the line of the first thing that is wrong.
+"""
+
+import csv
+import io
+import re
+import zlib
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import BinaryIO
+
+import numpy as np
+
+from calib_core.problem import Problem
+from calib_core.recording import Recording
+from calib_core.recording_check import RowProblem, check, check_names, is_known
+
+FORMAT = "gyro-recording 1"
+_LINE = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n)?")
+_BLOCK_BYTES = 1 << 18
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A CSV text taken apart: ``# key: value`` lines, column names, and where the rows begin."""
+
+    header: dict[str, str]
+    names: list[str]
+    body: memoryview
+    line: int  # of the first row, from 1
+
+
+def read_any(data: bytes | BinaryIO, *, name: str, mapping: Mapping[str, str], max_bytes: int) -> Recording:
+    """See ``recording.read``."""
+    raw = load(data, max_bytes)
+    if raw[:4] == b"PAR1":
+        from calib_core import recording_parquet
+
+        return recording_parquet.read(raw, mapping=mapping, max_bytes=max_bytes)
+    table = split(raw)
+    names = rename(table.names, mapping)
+    refuse_other_formats(table.header, names, name)
+    check_names(names)
+    try:
+        return check(_fast(table, names) or _slow(table, names))
+    except RowProblem as problem:
+        row = int(str(problem.values["row"]))
+        raise problem.at_line(next(islice(rows(table), row, None))[0]) from None
+
+
+def load(data: bytes | BinaryIO, max_bytes: int) -> bytes:
+    """All of ``data``, unpacked if it is gzip; raises Problem when it is empty, too large, truncated or corrupt."""
+    raw = data if isinstance(data, bytes) else data.read(max_bytes + 1)
+    if raw[:2] == b"\x1f\x8b" and len(raw) <= max_bytes:
+        raw = _gunzip(raw, max_bytes)
+    if len(raw) > max_bytes:
+        raise Problem("recording.too_large", limit_MB=max_bytes / 1e6)
+    if not raw:
+        raise Problem("recording.empty")
+    return raw
+
+
+def _gunzip(packed: bytes, max_bytes: int) -> bytes:
+    """At most ``max_bytes`` + 1 bytes, so that a small file cannot fill the memory."""
+    parts: list[bytes] = []
+    size = 0
+    while packed and size <= max_bytes:
+        member = zlib.decompressobj(wbits=31)
+        try:
+            parts.append(member.decompress(packed, max_bytes + 1 - size))
+        except zlib.error:
+            raise Problem("recording.gzip_corrupt") from None
+        size += len(parts[-1])
+        if not member.eof and size <= max_bytes:
+            raise Problem("recording.gzip_truncated")
+        packed = member.unused_data.lstrip(b"\0")
+    return b"".join(parts)
+
+
+def split(raw: bytes) -> TextTable:
+    """Header, names and body of a CSV text; raises Problem when it is not text or has no line of names."""
+    if raw[:4] in (b"PK\x03\x04", b"\xd0\xcf\x11\xe0") or raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise Problem("recording.not_text", line=1)
+    at = 3 if raw[:3] == b"\xef\xbb\xbf" else 0
+    header: dict[str, str] = {}
+    line = 0
+    while at < len(raw):
+        found = _LINE.match(raw, at)
+        assert found is not None
+        at, line = found.end(), line + 1
+        text = _text(found.group(), line).strip()
+        if text.startswith(("#", '"#')):
+            _add_header(header, text)
+        elif text.strip(", \t"):
+            if "," not in text and (";" in text or "\t" in text):
+                raise Problem("recording.not_commas", line=line, separator=";" if ";" in text else "TAB")
+            names = [cell.strip() for cell in next(csv.reader([text]))]
+            return TextTable(header, names, memoryview(raw)[at:], line + 1)
+    raise Problem("recording.no_rows")
+
+
+def _text(data: bytes, line: int) -> str:
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        raise Problem("recording.not_text", line=line) from None
+    if "\0" in text:
+        raise Problem("recording.not_text", line=line)
+    return text
+
+
+def _add_header(header: dict[str, str], text: str) -> None:
+    """``# key: value``; a spreadsheet quotes such a line and fills it up with commas. Repeated keys are joined."""
+    text = next(csv.reader([text]))[0] if text.startswith('"') else text.rstrip(",")
+    key, colon, value = text.lstrip("#").partition(":")
+    key, value = (key.strip(), value.strip()) if colon else ("comment", key.strip())
+    if value:
+        header[key] = f"{header[key]}; {value}" if key in header else value
+
+
+def rename(names: Sequence[str], mapping: Mapping[str, str]) -> list[str]:
+    """The columns under our names; raises Problem where the mapping names a column that is not there."""
+    for foreign in mapping:
+        if foreign not in names:
+            raise Problem("recording.no_such_column", column=foreign, columns=", ".join(names))
+    return [mapping.get(name, name) for name in names]
+
+
+def refuse_other_formats(header: Mapping[str, str], names: Sequence[str], name: str) -> None:
+    """Refuse what says, or looks as if, it is something else than ``gyro-recording 1``."""
+    kind = header.get("format", FORMAT)
+    if kind.startswith("gyro-points") or ("time_s" not in names and "set_point" in names):
+        raise Problem("recording.is_points", file=name)
+    if kind != FORMAT:
+        raise Problem("recording.unknown_format", format=kind, known=FORMAT)
+
+
+def _fast(table: TextTable, names: Sequence[str]) -> Recording | None:
+    """The recording by pyarrow, on one thread; None where it refuses a cell or a row."""
+    import pyarrow as pa
+    import pyarrow.csv as pa_csv
+
+    types = {name: pa.float64() for name in names}
+    if "segment" in types:
+        types["segment"] = pa.dictionary(pa.int32(), pa.string())
+    try:
+        columns = pa_csv.read_csv(
+            pa.BufferReader(pa.py_buffer(table.body)),
+            read_options=pa_csv.ReadOptions(use_threads=False, block_size=_BLOCK_BYTES, column_names=list(names)),
+            convert_options=pa_csv.ConvertOptions(
+                column_types=types, null_values=["", "nan", "NaN"], strings_can_be_null=False
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    # Adding zero turns -0.0 into 0.0: one number, one spelling, one digest.
+    numbers = {name: columns.column(name).to_numpy() + 0.0 for name in names if name != "segment"}
+    codes, segments = np.zeros(len(columns), np.int32), ("",)
+    if "segment" in types:
+        chunks = columns.column("segment").unify_dictionaries().chunks
+        codes = np.concatenate([chunk.indices.to_numpy(zero_copy_only=False) for chunk in chunks])
+        segments = tuple(chunks[0].dictionary.to_pylist())
+    return Recording(numbers.pop("time_s"), numbers, codes, segments, table.header)
+
+
+def rows(table: TextTable) -> Iterator[tuple[int, list[str]]]:
+    """Each row that is not blank with the line it begins on; raises Problem where the text breaks off."""
+    text = io.TextIOWrapper(io.BytesIO(table.body), encoding="utf-8", newline="")
+    reader = csv.reader(text)
+    while True:
+        line = table.line + reader.line_num
+        try:
+            cells = next(reader)
+        except StopIteration:
+            return
+        except UnicodeDecodeError:
+            raise Problem("recording.not_text", line=line) from None
+        except csv.Error:
+            raise Problem("recording.broken_row", line=line) from None
+        if not any(cell.strip() for cell in cells) and len(cells) < 2:
+            continue
+        if len(cells) != len(table.names):
+            raise Problem("recording.cells", line=line, cells=len(cells), needed=len(table.names))
+        yield line, cells
+
+
+def _slow(table: TextTable, names: Sequence[str]) -> Recording:
+    """The recording row by row; raises Problem at the first bad cell.
+
+    A foreign column of text that nobody asked for is left out.
+    """
+    numbers = {name: array("d") for name in names}
+    segments: dict[str, int] = {}
+    codes = array("i")
+    for line, cells in rows(table):
+        for name, cell in zip(names, cells, strict=True):
+            if name == "segment":
+                codes.append(segments.setdefault(cell, len(segments)))
+            elif name in numbers:
+                value = number(cell)
+                if value is not None:
+                    numbers[name].append(value)
+                elif is_known(name):
+                    raise Problem("recording.not_a_number", line=line, column=name, cell=cell[:40])
+                else:
+                    del numbers[name]
+    numbers.pop("segment", None)
+    columns = {name: np.frombuffer(values, np.float64) + 0.0 for name, values in numbers.items()}
+    time_s = columns.pop("time_s")
+    return Recording(
+        time_s,
+        columns,
+        np.array(codes if codes else np.zeros(len(time_s)), np.int32),
+        tuple(segments) or ("",),
+        table.header,
+    )
+
+
+def number(cell: str) -> float | None:
+    """The cell's number, NaN for an empty one, None for text."""
+    cell = cell.strip()
+    if not cell:
+        return np.nan
+    try:
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None
+
+
+def write(recording: Recording, file: BinaryIO) -> None:
+    """See ``recording.write_csv``."""
+    import pyarrow as pa
+    import pyarrow.csv as pa_csv
+
+    names = ["time_s", *recording.columns]
+    columns = [pa.array(values, from_pandas=True) for values in (recording.time_s, *recording.columns.values())]
+    quoting = "none"
+    if any(recording.segment_names):
+        names.append("segment")
+        columns.append(pa.array(recording.segment_names, pa.string()).take(pa.array(recording.segment_codes)))
+        if any(set(',"') & set(name) for name in recording.segment_names):
+            quoting = "needed"
+    file.write(header_lines(FORMAT, recording.header))
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerow(names)
+    file.write(text.getvalue().encode())
+    sink = pa.BufferOutputStream()
+    options = pa_csv.WriteOptions(include_header=False, quoting_style=quoting)
+    pa_csv.write_csv(pa.Table.from_arrays(columns, names), sink, options)
+    file.write(sink.getvalue())
+
+
+def header_lines(kind: str, header: Mapping[str, str]) -> bytes:
+    """``# key: value`` lines, the format first; control characters, which would break a line, become spaces."""
+    entries = {"format": kind, **{key: value for key, value in header.items() if key != "format"}}
+    lines = [re.sub(r"[\x00-\x1f\x7f]+", " ", f"# {key}: {value}") for key, value in entries.items()]
+    return "".join(line.rstrip() + "\n" for line in lines).encode()
