@@ -1,0 +1,182 @@
+"""One SQLite file: opening, numbered migrations, transactions, and its errors as sentences."""
+
+import json
+import re
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sqlite_utils import Database, Migrations
+
+from calib_core.problem import Problem
+
+FILE = "gyrobench.sqlite"
+BUSY_S = 10.0
+Row = dict[str, Any]
+
+migrations = Migrations("gyrobench")
+
+
+@migrations(name="0001_session")
+def _session(db: Database) -> None:
+    db.table("boards").create({"id": str, "gyro_model": str, "note": str, "created_at": str}, pk="id")
+    db.table("gyro_models").create({"id": str, "body": str, "created_at": str}, pk="id")
+    db.table("recordings").create(
+        {
+            "id": str, "name": str, "board": str, "run": str, "source": str, "header": str, "digest": str,
+            "samples": int, "duration_s": float, "created_at": str,
+        },
+        pk="id",
+    )  # fmt: skip
+    db.table("blocks").create(
+        {"id": int, "recording": str, "kind": str, "state": str, "live": int, "samples": int, "end_s": float,
+         "data": bytes},
+        pk="id",
+        foreign_keys=[("recording", "recordings", "id")],
+    )  # fmt: skip
+    db.table("blocks").create_index(["recording", "kind", "state"])
+    db.table("runs").create(
+        {
+            "id": str, "board": str, "gyro_model": str, "profile": str, "status": str, "recording": str,
+            "certificate": str, "request": str, "plan": str, "states": str, "message": str, "created_at": str,
+            "started_at": str, "finished_at": str,
+        },
+        pk="id",
+    )  # fmt: skip
+    db.table("runs").create_index(["board"])
+    db.table("results").create({"run": str, "state": str, "body": str}, pk=("run", "state"))
+    db.table("certificates").create(
+        {"number": str, "key": str, "board": str, "recording": str, "verdict": str, "issued_at": str, "operator": str,
+         "content": str},
+        pk="number",
+    )  # fmt: skip
+    db.table("certificates").create_index(["key"], unique=True)
+    for verb in ("update", "delete"):
+        db.execute(
+            f"create trigger certificates_no_{verb} before {verb} on certificates "
+            "begin select raise(abort, 'certificates are never changed'); end"
+        )
+
+
+class Connection:
+    """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
+
+    def __init__(self, data: Path) -> None:
+        """Opens or creates the file in ``data``. Raises Problem where that cannot be."""
+        self.path = data / FILE
+        self._lock = threading.RLock()
+        try:
+            data.mkdir(parents=True, exist_ok=True)
+            with told(self.path):
+                raw = sqlite3.connect(self.path, timeout=BUSY_S, check_same_thread=False)
+                self.db = Database(raw)
+                self.db.enable_wal()
+                self.db.execute("pragma synchronous = normal")
+                self.db.execute("pragma foreign_keys = on")
+                if migrations.pending(self.db):
+                    # Another process may open a new file at the same moment: look again inside the transaction.
+                    with self.write():
+                        migrations.apply(self.db)
+        except OSError as error:
+            raise Problem("store.cannot_open", path=str(data), reason=error.strerror or str(error)) from error
+
+    def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[Row]:
+        with self._lock, told(self.path):
+            return list(self.db.query(sql, parameters))
+
+    @contextmanager
+    def write(self, *, durable: bool = False) -> Iterator[Database]:
+        """One transaction, all or nothing; ``durable`` waits until the disk has it (synchronous FULL)."""
+        with self._lock, told(self.path):
+            if self.db.conn.in_transaction:
+                yield self.db
+                return
+            if durable:
+                self.db.execute("pragma synchronous = full")
+            try:
+                # Immediate, because a reader that turns writer is refused at once where another writes.
+                self.db.execute("begin immediate")
+                try:
+                    yield self.db
+                    self.db.execute("commit")
+                except BaseException:
+                    self.db.rollback()
+                    raise
+            finally:
+                if durable:
+                    self.db.execute("pragma synchronous = normal")
+
+    def close(self) -> None:
+        with self._lock:
+            self.db.close()
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """SQLite's errors as Problems that say what to do."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        code = {
+            sqlite3.SQLITE_FULL: "store.full",
+            sqlite3.SQLITE_BUSY: "store.locked",
+            sqlite3.SQLITE_CANTOPEN: "store.cannot_open",
+            sqlite3.SQLITE_READONLY: "store.cannot_open",
+            sqlite3.SQLITE_NOTADB: "store.not_a_store",
+            sqlite3.SQLITE_CORRUPT: "store.not_a_store",
+            sqlite3.SQLITE_IOERR: "store.failed",
+        }.get(getattr(error, "sqlite_errorcode", 0) & 0xFF)
+        if code is None:
+            raise
+        raise Problem(code, path=str(path), reason=str(error)) from error
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def dumps(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+
+
+_ID = re.compile(r"[A-Za-z0-9ก-๙][A-Za-z0-9ก-๙._-]{0,63}")
+
+
+def checked_id(value: str, what: str) -> str:
+    """An id as a person types it: it ends up in file names and addresses. Raises Problem ``<what>.characters``."""
+    if not _ID.fullmatch(value):
+        raise Problem(f"{what}.characters", given=value[:80])
+    return value
+
+
+def page(
+    connection: Connection,
+    select: str,
+    where: Sequence[str],
+    parameters: Sequence[object],
+    limit: int,
+    cursor: str | None,
+) -> tuple[list[Row], str | None]:
+    """Rows newest first, at most ``limit``, and the cursor of the next page; ``select`` names rowid as "at"."""
+    conditions, values = list(where), list(parameters)
+    if cursor is not None:
+        if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 16):
+            raise Problem("request.cursor", given=cursor)
+        conditions.append("rowid < ?")
+        values.append(int(cursor))
+    clause = f" where {' and '.join(conditions)}" if conditions else ""
+    found = connection.rows(f"{select}{clause} order by rowid desc limit ?", [*values, limit + 1])
+    more = len(found) > limit
+    found = found[:limit]
+    following = str(found[-1]["at"]) if more else None
+    for row in found:
+        del row["at"]
+    return found, following
+
+
+def like(q: str) -> str:
+    return "%" + re.sub(r"([%_\\])", r"\\\1", q) + "%"

@@ -1,0 +1,112 @@
+"""Runs: what was asked, how far it went, what each state gave."""
+
+import json
+import secrets
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from calib_core.problem import Problem
+from server.store_db import Connection, Row, dumps, like, now, page
+
+SELECT = "select rowid as at, * from runs"
+JSON_COLUMNS = ("request", "plan", "states", "message")
+ENDED = ("finished", "stopped", "failed", "interrupted")
+
+
+class Runs:
+    def __init__(self, connection: Connection) -> None:
+        self._at = connection
+
+    def create(
+        self,
+        *,
+        board: str,
+        gyro_model: str,
+        profile: str,
+        recording: str,
+        request: Mapping[str, Any],
+        plan: Mapping[str, Any],
+        states: Sequence[str],
+    ) -> str:
+        """A queued run. ``plan`` is its own copy of everything it needs, the gyro model included."""
+        run = secrets.token_hex(6)
+        row = {
+            "id": run, "board": board, "gyro_model": gyro_model, "profile": profile, "status": "queued",
+            "recording": recording, "certificate": None, "request": dumps(dict(request)), "plan": dumps(dict(plan)),
+            "states": dumps([{"name": name, "status": "waiting"} for name in states]), "message": None,
+            "created_at": now(), "started_at": None, "finished_at": None,
+        }  # fmt: skip
+        with self._at.write() as db:
+            db.table("runs").insert(row)
+            db.table("recordings").update(recording, {"run": run})
+        return run
+
+    def get(self, run: str) -> Row:
+        found = self._at.rows(f"{SELECT} where id = ?", [run])
+        if not found:
+            raise Problem("run.not_found", run=run)
+        row = _shown(found[0])
+        del row["at"]
+        return {**row, "results": self.results(run)}
+
+    def find(
+        self, *, q: str = "", board: str = "", status: str = "", limit: int = 50, cursor: str | None = None
+    ) -> tuple[list[Row], str | None]:
+        where, values = [], []
+        if q:
+            where.append("(id = ? or board like ? escape '\\' or request like ? escape '\\')")
+            values += [q, like(q), like(q)]
+        for column, wanted in (("board", board), ("status", status)):
+            if wanted:
+                where.append(f"{column} = ?")
+                values.append(wanted)
+        rows, following = page(self._at, SELECT, where, values, limit, cursor)
+        return [_shown(row) for row in rows], following
+
+    def start(self, run: str) -> None:
+        with self._at.write() as db:
+            db.table("runs").update(run, {"status": "running", "started_at": now()})
+
+    def set_state(self, run: str, state: str, status: str) -> None:
+        """``status``: waiting, running, done, failed or kept (taken over from the run that this one continues)."""
+        with self._at.write() as db:
+            states = self._states(run)
+            for entry in states:
+                if entry["name"] == state:
+                    entry["status"] = status
+            db.table("runs").update(run, {"states": dumps(states)})
+
+    def finish(
+        self, run: str, status: str, *, message: Mapping[str, Any] | None = None, certificate: str | None = None
+    ) -> None:
+        with self._at.write() as db:
+            states = self._states(run)
+            for entry in states:
+                if entry["status"] == "running":
+                    entry["status"] = "failed"
+            changes = {"status": status, "finished_at": now(), "states": dumps(states), "certificate": certificate}
+            db.table("runs").update(run, {**changes, "message": dumps(message) if message else None})
+
+    def interrupt_open(self) -> list[str]:
+        """Runs that say they are on though nothing runs them (the program was ended): mark them, keep their samples."""
+        open_runs = [row["id"] for row in self._at.rows("select id from runs where status in ('queued', 'running')")]
+        for run in open_runs:
+            self.finish(run, "interrupted", message={"code": "run.interrupted", "values": {}})
+        return open_runs
+
+    def set_result(self, run: str, state: str, result: Mapping[str, Any]) -> None:
+        with self._at.write() as db:
+            db.table("results").upsert({"run": run, "state": state, "body": dumps(dict(result))}, pk=("run", "state"))
+
+    def results(self, run: str) -> dict[str, Any]:
+        rows = self._at.rows("select state, body from results where run = ? order by rowid", [run])
+        return {row["state"]: json.loads(row["body"]) for row in rows}
+
+    def _states(self, run: str) -> list[dict[str, str]]:
+        found = self._at.rows("select states from runs where id = ?", [run])
+        states: list[dict[str, str]] = json.loads(found[0]["states"])
+        return states
+
+
+def _shown(row: Row) -> Row:
+    return {**row, **{name: None if row[name] is None else json.loads(row[name]) for name in JSON_COLUMNS}}
