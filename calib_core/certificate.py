@@ -86,12 +86,22 @@ def concise(value: float, uncertainty: float) -> str:
     """``5.9482(31)``, ``45.6(1.2)``: the value, its standard uncertainty in units of its last two digits."""
     if not (math.isfinite(uncertainty) and uncertainty > 0):
         return f"{value:.6g}"
-    # Two digits, and two still when 0.0996 rounds up to 0.10.
-    decimals = 1 - math.floor(math.log10(float(f"{uncertainty:.1e}")))
-    if decimals <= 0:
+    decimals = _decimals(uncertainty)
+    if decimals < 0:
         return f"{round(value, decimals):.0f}({round(uncertainty, decimals):.0f})"
-    digits = f"{uncertainty:.{decimals}f}"
-    return f"{value:.{decimals}f}({digits.removeprefix('0.').lstrip('0') if uncertainty < 1 else digits})"
+    digits = two_digits(uncertainty)
+    return f"{value:.{decimals}f}({digits.removeprefix('0.').lstrip('0') if digits < '1' else digits})"
+
+
+def two_digits(uncertainty: float) -> str:
+    """An uncertainty > 0 to two significant digits, without an exponent: 0.000084, 0.10, 1.2, 120."""
+    decimals = _decimals(uncertainty)
+    return f"{round(uncertainty, decimals):.{max(0, decimals)}f}"
+
+
+def _decimals(uncertainty: float) -> int:
+    """Decimals that show two significant digits, and two still when 0.0996 rounds up to 0.10."""
+    return 1 - math.floor(math.log10(float(f"{uncertainty:.1e}")))
 
 
 # --- specification (CONTRACT 2) ----------------------------------------------------------------------------------

@@ -1,1 +1,28 @@
-"""A certificate as PDF, CSV and JSON."""
+"""A certificate as PDF, CSV and JSON: the same content, the same bytes whenever it is asked for."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from calib_core.problem import Problem
+
+FORMATS = ("pdf", "csv", "json")
+MEDIA_TYPES = {"pdf": "application/pdf", "csv": "text/csv; charset=utf-8", "json": "application/json"}
+
+
+def render(content: Mapping[str, Any], kind: str, lang: str = "en") -> bytes:
+    """The certificate's ``content`` as a document of one of FORMATS; ``lang`` is the PDF's. Raises Problem.
+
+    A PDF takes about half a second of CPU: not for an event loop.
+    """
+    if kind == "json":
+        return (json.dumps(content, ensure_ascii=False, indent=1, allow_nan=False) + "\n").encode()
+    if kind == "csv":
+        from server.documents.csv_table import render_csv
+
+        return render_csv(content)
+    if kind == "pdf":
+        from server.documents.pdf import render_pdf
+
+        return render_pdf(content, lang)
+    raise Problem("document.format", given=kind, allowed=", ".join(FORMATS))
