@@ -5,6 +5,7 @@ about spaces, and knows the line of the first thing that is wrong.
 """
 
 import csv
+import gzip
 import io
 import re
 import zlib
@@ -18,7 +19,7 @@ import numpy as np
 
 from calib_core.problem import Problem
 from calib_core.recording import Recording
-from calib_core.recording_check import RowProblem, check, check_names, is_known
+from calib_core.recording_check import check, check_names, is_known, listed
 
 FORMAT = "gyro-recording 1"
 _LINE = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n)?")
@@ -45,12 +46,16 @@ def read_any(data: bytes | BinaryIO, *, name: str, mapping: Mapping[str, str], m
     table = split(raw)
     names = rename(table.names, mapping)
     refuse_other_formats(table.header, names, name)
-    check_names(names)
+    check_names(names, table.line - 1)
+    recording = _fast(table, names) or _slow(table, names)
     try:
-        return check(_fast(table, names) or _slow(table, names))
-    except RowProblem as problem:
-        row = int(str(problem.values["row"]))
-        raise problem.at_line(next(islice(rows(table), row, None))[0]) from None
+        return check(recording)
+    except Problem as problem:
+        if "line" not in problem.values:
+            raise
+        row = int(str(problem.values["line"])) - 1
+        line = next(islice(rows(table), row, None))[0]
+        raise Problem(problem.code, **{**problem.values, "line": line}) from None
 
 
 def load(data: bytes | BinaryIO, max_bytes: int) -> bytes:
@@ -61,25 +66,18 @@ def load(data: bytes | BinaryIO, max_bytes: int) -> bytes:
     if len(raw) > max_bytes:
         raise Problem("recording.too_large", limit_MB=max_bytes / 1e6)
     if not raw:
-        raise Problem("recording.empty")
+        raise Problem("recording.empty_file")
     return raw
 
 
 def _gunzip(packed: bytes, max_bytes: int) -> bytes:
     """At most ``max_bytes`` + 1 bytes, so that a small file cannot fill the memory."""
-    parts: list[bytes] = []
-    size = 0
-    while packed and size <= max_bytes:
-        member = zlib.decompressobj(wbits=31)
-        try:
-            parts.append(member.decompress(packed, max_bytes + 1 - size))
-        except zlib.error:
-            raise Problem("recording.gzip_corrupt") from None
-        size += len(parts[-1])
-        if not member.eof and size <= max_bytes:
-            raise Problem("recording.gzip_truncated")
-        packed = member.unused_data.lstrip(b"\0")
-    return b"".join(parts)
+    try:
+        return gzip.GzipFile(fileobj=io.BytesIO(packed)).read(max_bytes + 1)
+    except EOFError:
+        raise Problem("recording.gzip_truncated") from None
+    except (OSError, zlib.error):
+        raise Problem("recording.gzip_corrupt") from None
 
 
 def split(raw: bytes) -> TextTable:
@@ -95,12 +93,11 @@ def split(raw: bytes) -> TextTable:
         at, line = found.end(), line + 1
         text = _text(found.group(), line).strip()
         if text.startswith(("#", '"#')):
-            _add_header(header, text)
+            _add_header(header, text, line)
         elif text.strip(", \t"):
             if "," not in text and (";" in text or "\t" in text):
                 raise Problem("recording.not_commas", line=line, separator=";" if ";" in text else "TAB")
-            names = [cell.strip() for cell in next(csv.reader([text]))]
-            return TextTable(header, names, memoryview(raw)[at:], line + 1)
+            return TextTable(header, [cell.strip() for cell in _cells(text, line)], memoryview(raw)[at:], line + 1)
     raise Problem("recording.no_rows")
 
 
@@ -114,9 +111,16 @@ def _text(data: bytes, line: int) -> str:
     return text
 
 
-def _add_header(header: dict[str, str], text: str) -> None:
+def _cells(text: str, line: int) -> list[str]:
+    try:
+        return next(csv.reader([text]))
+    except csv.Error:
+        raise Problem("recording.broken_row", line=line) from None
+
+
+def _add_header(header: dict[str, str], text: str, line: int) -> None:
     """``# key: value``; a spreadsheet quotes such a line and fills it up with commas. Repeated keys are joined."""
-    text = next(csv.reader([text]))[0] if text.startswith('"') else text.rstrip(",")
+    text = _cells(text, line)[0] if text.startswith('"') else text.rstrip(",")
     key, colon, value = text.lstrip("#").partition(":")
     key, value = (key.strip(), value.strip()) if colon else ("comment", key.strip())
     if value:
@@ -127,7 +131,7 @@ def rename(names: Sequence[str], mapping: Mapping[str, str]) -> list[str]:
     """The columns under our names; raises Problem where the mapping names a column that is not there."""
     for foreign in mapping:
         if foreign not in names:
-            raise Problem("recording.no_such_column", column=foreign, columns=", ".join(names))
+            raise Problem("recording.no_such_column", column=foreign, columns=listed(names))
     return [mapping.get(name, name) for name in names]
 
 
@@ -137,7 +141,7 @@ def refuse_other_formats(header: Mapping[str, str], names: Sequence[str], name: 
     if kind.startswith("gyro-points") or ("time_s" not in names and "set_point" in names):
         raise Problem("recording.is_points", file=name)
     if kind != FORMAT:
-        raise Problem("recording.unknown_format", format=kind, known=FORMAT)
+        raise Problem("recording.unknown_format", format=kind[:40], known=FORMAT)
 
 
 def _fast(table: TextTable, names: Sequence[str]) -> Recording | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib_core.problem import Problem
 from calib_core.recording import Recording
-from calib_core.recording_check import RowProblem, check, check_names, is_known
+from calib_core.recording_check import check, check_names, is_known
 from calib_core.recording_file import FORMAT, refuse_other_formats, rename
 
 _HEADER_KEY = b"gyro-recording"
@@ -45,10 +45,7 @@ def read(raw: bytes, *, mapping: Mapping[str, str], max_bytes: int) -> Recording
             numbers[name] = column.cast(pa.float64(), safe=False).to_numpy() + 0.0
         elif is_known(name):
             raise Problem("recording.not_a_number", line=1, column=name, cell=str(column.type))
-    try:
-        return check(Recording(numbers.pop("time_s"), numbers, codes, segments, header))
-    except RowProblem as problem:
-        raise problem.at_line(int(str(problem.values["row"])) + 1) from None
+    return check(Recording(numbers.pop("time_s"), numbers, codes, segments, header))
 
 
 def _header(metadata: Mapping[bytes, bytes]) -> dict[str, str]:
