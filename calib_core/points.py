@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -45,8 +45,8 @@ class Points:
 
     def take(self, chosen: npt.NDArray[Any] | slice) -> "Points":
         """The readings of a boolean mask (n,), of indices or of a slice."""
-        arrays = (self.test, self.set_point, self.reference, self.gyro, self.reading, self.duration_s)
-        return Points(self.board[chosen], self.axis[chosen], self.kind, *(array[chosen] for array in arrays))
+        arrays = {field.name: getattr(self, field.name)[chosen] for field in fields(self) if field.name != "kind"}
+        return Points(kind=self.kind, **arrays)
 
 
 def read(data: bytes | BinaryIO, *, mapping: Mapping[str, str] | None = None, max_bytes: int = MAX_BYTES) -> Points:
