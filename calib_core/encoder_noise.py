@@ -1,0 +1,102 @@
+"""How far an encoder's reading may be from the truth: its step, rests, and motion that repeats the same codes.
+
+METHOD 2: a moving reading has the variance step²/12, times half its run of equal codes (the error is the same sawtooth
+all along a run), times how often its code pattern recurs (a motion locked to the clock never averages quantisation).
+At rest the error is one draw however many readings there are, so a whole rest is one reading.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+REST_S = 0.4
+"""The same code for at least this long is a rest."""
+SETTLING_S = 0.1
+"""Cut from both ends of a rest: the table may still creep within the code."""
+PATTERN = 16
+"""Two readings see the same motion where this many codes before and after them are equal."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What is known about m readings: the encoder's step (0 if it has none) and, for each, run and recurrence."""
+
+    step_deg: float
+    run: Ints
+    """(m,) how many consecutive readings share this one's code."""
+    recurrence: Ints
+    """(m,) how many different runs show this one's code pattern."""
+    rest: Ints
+    """(m,) the number of the rest it belongs to, -1 while moving."""
+
+    @property
+    def variance(self) -> F64:
+        """(m,) deg², of the error of each reading as such; a rest's readings share one error."""
+        spread = np.where(self.rest >= 0, 1.0, np.maximum(1.0, self.run / 2.0))
+        return self.step_deg**2 / 12.0 * spread
+
+
+def step_of(angle_deg: F64) -> float:
+    """The spacing of the codes in deg, from the angles (m,) alone; 0 where they lie on no grid, or are all equal."""
+    levels = np.unique(np.round(angle_deg, 6))
+    gaps = np.diff(levels)
+    if len(gaps) == 0:
+        return 0.0
+    step = float(gaps.min())
+    for _ in range(3):
+        # Printed angles are rounded: the smallest gap is off by that, the slope over all codes is not.
+        codes = np.round((levels - levels[0]) / step)
+        step = float(codes @ (levels - levels[0]) / (codes @ codes))
+    off_grid = np.abs(levels - levels[0] - step * codes).max()
+    return step if off_grid < 0.1 * step else 0.0
+
+
+def inspect(time_s: F64, angle_deg: F64) -> Readings:
+    """Steps, runs, rests and recurrence of the readings (m,) at increasing times (m,)."""
+    m = len(angle_deg)
+    step = step_of(angle_deg)
+    if step == 0.0:
+        same = np.zeros(m, np.int64)
+        still = len(np.unique(angle_deg)) == 1
+        return Readings(0.0, np.full(m, m if still else 1), np.ones(m, np.int64), same if still else same - 1)
+    codes = np.round(angle_deg / step).astype(np.int64)
+    first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1) != 0)
+    last = np.append(first[1:], m) - 1
+    length = last - first + 1
+    number = np.repeat(np.arange(len(first)), length)
+
+    resting = time_s[last] - time_s[first] >= REST_S
+    resting &= ~_passing(codes[first], length)
+    rest = np.where(resting[number], np.cumsum(resting)[number] - 1, -1)
+    trimmed = (time_s - time_s[first][number] < SETTLING_S) & (number > 0)
+    trimmed |= (time_s[last][number] - time_s < SETTLING_S) & (number < len(first) - 1)
+    rest[trimmed] = -1
+    run = np.where(resting[number] & (rest < 0), np.searchsorted(time_s, time_s[0] + SETTLING_S), length[number])
+    return Readings(step, run, _recurrence(codes, number), rest)
+
+
+def _passing(code: Ints, length: Ints) -> NDArray[np.bool_]:
+    """Which runs are slow motion in one direction, not a rest: neighbours one code away, and long themselves."""
+    passing = np.zeros(len(code), bool)
+    step = np.diff(code)
+    on = (step[1:] == step[:-1]) & (np.abs(step[1:]) == 1)
+    passing[1:-1] = on & (np.minimum(length[:-2], length[2:]) > 0.3 * length[1:-1])
+    return passing
+
+
+def _recurrence(codes: Ints, number: Ints) -> Ints:
+    """In how many different runs each reading's pattern of codes is seen."""
+    m = len(codes)
+    if m <= 2 * PATTERN:
+        return np.ones(m, np.int64)
+    weights = np.random.default_rng(0).integers(1, 2**62, 2 * PATTERN + 1)
+    with np.errstate(over="ignore"):
+        pattern = np.convolve(codes, weights, mode="valid")  # wraps: a hash of the codes around each reading
+    pattern = np.concatenate([np.full(PATTERN, pattern[0]), pattern, np.full(PATTERN, pattern[-1])])
+    pairs = np.unique(np.stack([pattern, number]), axis=1)
+    seen, runs = np.unique(pairs[0], return_counts=True)
+    return runs[np.searchsorted(seen, pattern)]

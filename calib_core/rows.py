@@ -1,0 +1,181 @@
+"""From a recording to rows: mean gyro output over each interval against the true rate over the same interval.
+
+Encoder recordings (METHOD 2): the integral of V between two readings against the angle between them; inside a rest the
+true rate is exactly zero, so every sample is a row of its own. A reference rate, or a stationary record, gives one row
+per sample. Columns of effects are averaged over the same intervals by ``Averages``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core import encoder_noise
+from calib_core.problem import Problem
+from calib_core.recording import Recording
+from calib_core.whitening import Rows
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+GAP = 2.5
+"""A gap of more than this many sampling intervals interrupts the record."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The gyro's samples (k,) that take part, at their own times; ``start`` marks the first after each gap."""
+
+    unit: str
+    time_s: F64
+    output: F64
+    start: Mask
+    interval_s: float
+    average_s: float
+    """Each sample is a mean over this span (0: a point)."""
+    index: Ints
+    """(k,) their rows in the recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class Averages:
+    """Means over the rows' intervals of anything known at the gyro's samples."""
+
+    samples: Samples
+    begin_s: F64
+    end_s: F64
+    """(n,) the interval of each row; equal where the row is one sample."""
+    at: Ints
+    """(n,) that sample, -1 for an interval."""
+
+    def mean(self, values: F64, *, shift_s: float = 0.0, average_s: float = 0.0) -> F64:
+        """(n,) means of ``values`` (k,) over the intervals, moved later by ``shift_s``; samples stay where they are."""
+        out = np.empty(len(self.at))
+        single = self.at >= 0
+        out[single] = values[self.at[single]]
+        between = ~single
+        if between.any():
+            s = self.samples
+            begin, end = self.begin_s[between], self.end_s[between]
+            integral = Integral(s.time_s, values, s.start, average_s)
+            out[between] = (integral(end + shift_s) - integral(begin + shift_s)) / (end - begin)
+        return out
+
+    def change(self, values: F64) -> F64:
+        """(n,) (end - beginning)/length of ``values`` (k,) over each interval; for a sample, its slope."""
+        s = self.samples
+        slope = np.gradient(values, s.time_s)
+        out = slope[np.maximum(self.at, 0)]
+        between = self.at < 0
+        begin, end = self.begin_s[between], self.end_s[between]
+        out[between] = (np.interp(end, s.time_s, values) - np.interp(begin, s.time_s, values)) / (end - begin)
+        return out
+
+
+class Integral:
+    """∫ values dt as a function of time: the integral of the cubic through values and slopes.
+
+    At the samples this is the corrected trapezoid rule, -h²/12·(f'(b) - f'(a)). Samples that are means over a span w
+    of the signal have lost w²/24·f''; its integral is put back.
+    """
+
+    def __init__(self, time_s: F64, values: F64, start: Mask, average_s: float = 0.0) -> None:
+        self._t, self._f = time_s, values
+        self._slope = np.gradient(values, time_s)
+        h = np.diff(time_s)
+        piece = h * (values[1:] + values[:-1]) / 2.0 - h**2 / 12.0 * np.diff(self._slope)
+        piece[start[1:]] = 0.0
+        self._sum = np.concatenate([[0.0], np.cumsum(piece)])
+        self._blur = average_s**2 / 24.0
+
+    def __call__(self, at_s: F64) -> F64:
+        k = np.clip(np.searchsorted(self._t, at_s, side="right") - 1, 0, len(self._t) - 2)
+        h = self._t[k + 1] - self._t[k]
+        u = (at_s - self._t[k]) / h
+        f0, f1, d0, d1 = self._f[k], self._f[k + 1], h * self._slope[k], h * self._slope[k + 1]
+        inside = u * (f0 + u * (d0 / 2 + u * ((3 * (f1 - f0) - 2 * d0 - d1) / 3 + u * (2 * (f0 - f1) + d0 + d1) / 4)))
+        slope = self._slope[k] + u * (self._slope[k + 1] - self._slope[k])
+        return np.asarray(self._sum[k] + h * inside - self._blur * slope)
+
+
+def samples(recording: Recording, axis: str, mask: Mask | None = None) -> Samples:
+    """The gyro's samples in ``mask`` (rows of the recording); raises Problem ``fit.too_short`` under eight."""
+    gyro = recording.gyro(axis)
+    there = np.isfinite(gyro.values)
+    if mask is not None:
+        there &= mask
+    index = np.flatnonzero(there)
+    if len(index) < 8:
+        raise Problem("fit.too_short", axis=axis, samples=len(index), least=8)
+    time = recording.time_s[index] + gyro.delay_s
+    step = np.diff(time)
+    interval = float(np.median(step))
+    start = np.concatenate([[True], step > GAP * interval])
+    average = float(recording.header.get("gyro_average_s", 0.0))
+    return Samples(gyro.unit, time, gyro.values[index], start, interval, average, index)
+
+
+def with_reference(s: Samples, rate_dps: F64) -> tuple[Rows, Averages, F64]:
+    """One row per sample that has a reference rate (all rows of the recording given): rows, averages, rate (n,)."""
+    rate = rate_dps[s.index]
+    at = np.flatnonzero(np.isfinite(rate))
+    if len(at) < 8:
+        raise Problem("fit.too_short", axis="", samples=len(at), least=8)
+    n, none = len(at), np.full(len(at), -1)
+    time = s.time_s[at]
+    start = np.diff(time, prepend=-np.inf) > GAP * s.interval_s
+    rows = Rows(time, np.full(n, s.interval_s), start, none, none, np.empty(0), s.interval_s)
+    return rows, Averages(s, time, time, at), rate[at]
+
+
+def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, F64, encoder_noise.Readings]:
+    """Rows between encoder readings, one per sample inside rests: rows, averages, mean rate (n,), the readings used.
+
+    ``time_s``, ``angle_deg`` (m,) are all readings of the recording; those outside the samples' stretches are left out.
+    """
+    order = np.argsort(time_s, kind="stable")
+    time, angle = time_s[order], angle_deg[order]
+    stretch = np.cumsum(s.start) - 1
+    first, last = s.time_s[s.start], s.time_s[np.append(s.start[1:], True)]
+    k = np.clip(np.searchsorted(first, time, side="right") - 1, 0, None)
+    inside = (time >= first[k]) & (time <= last[k]) & np.append(True, np.diff(time) > 0)
+    time, angle, k = time[inside], angle[inside], k[inside]
+    if len(time) < 3:
+        raise Problem("fit.no_reference", readings=len(time))
+    readings = encoder_noise.inspect(time, angle)
+
+    # One reading for each moving reading, one for each rest.
+    rest = readings.rest
+    new = (rest < 0) | (np.diff(rest, prepend=-1) != 0) | (np.diff(k, prepend=-1) != 0)
+    reading = np.cumsum(new) - 1
+    join = np.flatnonzero((np.diff(reading) == 1) & (np.diff(k) == 0))
+    moves = _pieces(time[join], time[join + 1], reading[join], reading[join + 1], np.full(len(join), -1))
+
+    # Rests: the samples whose whole interval lies inside.
+    begin = np.flatnonzero(new & (rest >= 0))
+    end = np.append(np.flatnonzero(new)[1:], len(time))[reading[begin]] - 1
+    half = s.interval_s / 2.0
+    low, high = np.searchsorted(s.time_s, time[begin] + half), np.searchsorted(s.time_s, time[end] - half)
+    at = np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)] or [np.empty(0, int)]).astype(int)
+    none = np.full(len(at), -1)
+    stills = _pieces(s.time_s[at], s.time_s[at], none, none, at)
+
+    begin_s, end_s, before, after, at = (np.concatenate(pair) for pair in zip(moves, stills, strict=True))
+    middle = (begin_s + end_s) / 2.0
+    order = np.argsort(middle, kind="stable")
+    begin_s, end_s, before, after, at, middle = (x[order] for x in (begin_s, end_s, before, after, at, middle))
+    number = stretch[np.clip(np.searchsorted(s.time_s, middle, side="right") - 1, 0, None)]
+    dt = np.where(at >= 0, s.interval_s, end_s - begin_s)
+    moving = at < 0
+    rate = np.zeros(len(at))
+    level = angle[new]
+    rate[moving] = (level[after[moving]] - level[before[moving]]) / dt[moving]
+    start = np.diff(number, prepend=-1) != 0
+    rows = Rows(middle, dt, start, before, after, readings.variance[new], s.interval_s)
+    kept = encoder_noise.Readings(readings.step_deg, readings.run[new], readings.recurrence[new], rest[new])
+    return rows, Averages(s, begin_s, end_s, at), rate, kept
+
+
+def _pieces(begin_s: F64, end_s: F64, before: Ints, after: Ints, at: Ints) -> tuple[F64, F64, Ints, Ints, Ints]:
+    return begin_s, end_s, before, after, at

@@ -1,0 +1,158 @@
+"""Rows of a rate equation with correlated errors, and their whitening by one lower-banded solve.
+
+Each row says: mean output over a short interval = columns · parameters + gyro noise + encoder error. Gyro noise is
+white plus AR(1). A row between two encoder readings carries (S/dt)·(error before - error after), so neighbours share
+an error; rows at rest or with a reference rate carry none. METHOD 2 (n: quantisation plus a random walk), differenced.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class RowNoise:
+    """Gyro noise in the unit of the output: ``white`` is the deviation of one sample of length ``Rows.sample_s``."""
+
+    white: float
+    ar1: float = 0.0
+    correlation_time_s: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """n rows in time order, over m encoder readings."""
+
+    time_s: F64
+    """(n,) the middle of each row's interval."""
+    dt_s: F64
+    """(n,) its length."""
+    start: Mask
+    """(n,) True where the record was interrupted before this row: nothing is carried over."""
+    before: Ints
+    after: Ints
+    """(n,) which reading begins and ends the interval; -1 for a row without encoder."""
+    reading_variance: F64
+    """(m,) deg²; a reading that stands for a whole rest has one error."""
+    sample_s: float
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @cached_property
+    def ends(self) -> tuple[Ints, Ints]:
+        """The row that each reading (m,) ends and the row it begins; -1 where there is none."""
+        m = len(self.reading_variance)
+        ending, beginning = np.full(m, -1), np.full(m, -1)
+        ending[self.after[self.after >= 0]] = np.flatnonzero(self.after >= 0)
+        beginning[self.before[self.before >= 0]] = np.flatnonzero(self.before >= 0)
+        return ending, beginning
+
+    def take(self, chosen: Ints) -> "Rows":
+        """The rows ``chosen`` (increasing); nothing is carried over where one was left out."""
+        start = self.start[chosen] | (np.diff(chosen, prepend=-2) != 1)
+        before, after = self.before[chosen], self.after[chosen]
+        return Rows(self.time_s[chosen], self.dt_s[chosen], start, before, after, self.reading_variance, self.sample_s)
+
+    def to_readings(self, values: F64) -> F64:
+        """(m,) how the readings' errors (deg) meet ``values`` (n,): the adjoint of errors -> rows, for S = 1."""
+        ending, beginning = self.ends
+        per_dt = np.append(values / self.dt_s, 0.0)  # index -1 finds the zero
+        return per_dt[beginning] - per_dt[ending]
+
+
+class Whitener:
+    """Σ⁻¹ of the rows' errors for a given S and noise, as a square root: ``whiten`` makes errors white with unit variance.
+
+    AR(1) noise is first made short-ranged by y_j - φ·y_{j-1}; what remains has a covariance of bandwidth 2, factorised
+    by LAPACK. The error of a rest's reading ties together two rows far apart, its entry and its exit; those few are
+    added afterwards as rank-one terms through a symmetric square root.
+    """
+
+    def __init__(self, rows: Rows, scale_factor: float, noise: RowNoise) -> None:
+        from scipy.linalg import cholesky_banded
+
+        self._rows = rows
+        n = len(rows)
+        white = noise.white**2 * rows.sample_s / rows.dt_s
+        phi = np.zeros(n + 1)
+        if noise.ar1 > 0.0:
+            phi[1:n] = np.exp(-np.diff(rows.time_s) / noise.correlation_time_s)
+            phi[:n][rows.start] = 0.0
+        self._phi = phi[:n]
+        band = np.zeros((3, n + 2))
+        band[0, :n] = white + noise.ar1**2 * (1.0 - phi[:n] ** 2)
+        band[0, 1:n] += phi[1:n] ** 2 * white[:-1]
+        band[1, : n - 1] = -phi[1:n] * white[:-1]
+
+        ending, beginning = rows.ends
+        near = (ending < 0) | (beginning < 0) | (beginning == ending + 1)
+        sigma = abs(scale_factor) * np.sqrt(rows.reading_variance)
+        inverse_dt = np.append(1.0 / rows.dt_s, 0.0)
+        for group in (near & (ending >= 0), near & (ending < 0) & (beginning >= 0)):
+            e, b, s = ending[group], beginning[group], sigma[group]
+            first = np.where(e >= 0, e, b)
+            c0 = np.where(e >= 0, -inverse_dt[e], inverse_dt[b]) * s
+            c1 = np.where(e >= 0, inverse_dt[b], 0.0) * s - phi[first + 1] * c0
+            c2 = -np.where((e >= 0) & (b >= 0), phi[np.minimum(first + 2, n)] * inverse_dt[b], 0.0) * s
+            for lag, left, right in ((0, (c0, c1, c2), (c0, c1, c2)), (1, (c0, c1), (c1, c2)), (2, (c0,), (c2,))):
+                for shift, (x, y) in enumerate(zip(left, right, strict=True)):
+                    band[lag, first + shift] += x * y  # each reading has its own first row
+        if noise.ar1 <= 0.0:
+            band = band[:2]  # without φ nothing reaches two rows
+        self._factor = cholesky_banded(band[:, :n], lower=True, check_finite=False, overwrite_ab=True)
+        self.log_determinant = 2.0 * float(np.log(self._factor[0]).sum())
+        self._far = None
+        far = np.flatnonzero(~near)
+        if len(far):
+            self._add_rests(ending[far], beginning[far], sigma[far])
+
+    def _add_rests(self, entry: Ints, leave: Ints, sigma: F64) -> None:
+        """Σ += Σ_k u_k·u_kᵀ: u_k is the error of rest k, seen in its entry row and, reversed, in its exit row."""
+        n, k = len(self._rows), np.arange(len(entry))
+        u = np.zeros((n, len(entry)), order="F")
+        u[entry, k] = -sigma / self._rows.dt_s[entry]
+        u[leave, k] = sigma / self._rows.dt_s[leave]
+        c = self._lower(self._filter(u))
+        power, vectors = np.linalg.eigh(c.T @ c)
+        shrink = vectors * (-np.expm1(-0.5 * np.log1p(power)) / np.maximum(power, 1e-300)) @ vectors.T
+        self._far = (c, shrink)
+        self.log_determinant += float(np.log1p(power).sum())
+
+    def whiten(self, columns: F64) -> F64:
+        """(n,) or (n, p) in, the same shape out."""
+        columns = self._lower(self._filter(columns))
+        return self._shrink(columns)
+
+    def precision_times(self, white: F64) -> F64:
+        """Σ⁻¹·x (n,) for a column that ``whiten`` turned into ``white``."""
+        from scipy.linalg.lapack import dtbtrs
+
+        values, _ = dtbtrs(self._factor, self._shrink(white), uplo="L", trans="T")
+        out: F64 = values.reshape(white.shape).copy()
+        out[:-1] -= self._phi[1:] * out[1:].copy()
+        return out
+
+    def _filter(self, columns: F64) -> F64:
+        out = np.array(columns, dtype=float, order="F")
+        phi = self._phi[1:] if columns.ndim == 1 else self._phi[1:, None]
+        out[1:] -= phi * columns[:-1]
+        return out
+
+    def _lower(self, columns: F64) -> F64:
+        from scipy.linalg.lapack import dtbtrs
+
+        solved, _ = dtbtrs(self._factor, columns, uplo="L", overwrite_b=True)
+        return np.asarray(solved, dtype=float).reshape(columns.shape)
+
+    def _shrink(self, columns: F64) -> F64:
+        if self._far is None:
+            return columns
+        c, shrink = self._far
+        return np.asarray(columns - c @ (shrink @ (c.T @ columns)))
