@@ -1,0 +1,102 @@
+// The one module that knows addresses.
+
+import { language, t } from "./text.js";
+
+const ROOT = "/api/v1";
+const TOKEN = "gyrobench.token";
+const LEASE = "gyrobench.lease";
+
+// `serve` on an open address prints http://…/#token=…; keep it, and keep it out of the address bar.
+const given = new URLSearchParams(location.hash.slice(1)).get("token");
+if (given) {
+  localStorage.setItem(TOKEN, given);
+  history.replaceState(null, "", location.pathname + location.search);
+}
+
+/** A refusal or a failure, with the server's sentence in the reader's language as its message. */
+export class Refused extends Error {
+  constructor(problem, status) {
+    super(problem.detail ?? problem.title ?? t("page.failed", { status }));
+    this.status = status;
+    this.code = problem.code;
+    this.values = problem.values ?? {};
+  }
+}
+
+async function call(method, path, body) {
+  const headers = { "Accept-Language": language };
+  const token = localStorage.getItem(TOKEN);
+  const lease = sessionStorage.getItem(LEASE);
+  if (token) headers.Authorization = `Bearer ${token}`;
+  if (lease) headers["X-Rig-Lease"] = lease;
+  const isForm = body instanceof FormData;
+  if (body !== undefined && !isForm) headers["Content-Type"] = "application/json";
+  let answer;
+  try {
+    answer = await fetch(ROOT + path, { method, headers, body: isForm || body === undefined ? body : JSON.stringify(body) });
+  } catch {
+    throw new Refused({ detail: t("page.unreachable") }, 0);
+  }
+  if (answer.status === 204) return null;
+  const content = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Refused(content, answer.status);
+  return content;
+}
+
+const query = (values) => {
+  const kept = Object.entries(values).filter(([, value]) => value != null && value !== "");
+  return kept.length ? `?${new URLSearchParams(kept)}` : "";
+};
+const id = encodeURIComponent;
+
+export const api = {
+  health: () => call("GET", "/health"),
+  rig: () => call("GET", "/rig"),
+  chooseRig: (body) => call("PUT", "/rig", body),
+  checkRig: () => call("POST", "/rig/check"),
+  emergencyStop: () => call("POST", "/rig/stop"),
+  async holdRig(holder) {
+    const lease = await call("POST", "/rig/lease", { holder });
+    sessionStorage.setItem(LEASE, lease.token);
+    return lease;
+  },
+  async releaseRig() {
+    await call("DELETE", "/rig/lease");
+    sessionStorage.removeItem(LEASE);
+  },
+  holdsRig: () => sessionStorage.getItem(LEASE) !== null,
+
+  gyroModels: () => call("GET", `/gyro-models${query({ limit: 200 })}`),
+  createGyroModel: (model) => call("POST", "/gyro-models", model),
+  changeGyroModel: (model) => call("PUT", `/gyro-models/${id(model.id)}`, model),
+  removeGyroModel: (model) => call("DELETE", `/gyro-models/${id(model)}`),
+
+  boards: (q) => call("GET", `/boards${query(q)}`),
+  board: (board) => call("GET", `/boards/${id(board)}`),
+
+  fields: () => call("GET", "/fields"),
+
+  plan: (body) => call("POST", "/runs/plan", body),
+  start: (body) => call("POST", "/runs", body),
+  runs: (q) => call("GET", `/runs${query(q)}`),
+  run: (run) => call("GET", `/runs/${id(run)}`),
+  stopRun: (run) => call("POST", `/runs/${id(run)}/stop`),
+  comparison: (run, axis) => call("GET", `/runs/${id(run)}/comparison${query({ axis })}`),
+
+  certificates: (q) => call("GET", `/certificates${query(q)}`),
+  certificate: (number) => call("GET", `/certificates/${id(number)}`),
+  certify: (body) => call("POST", "/certificates", body),
+  verify: (number) => call("GET", `/certificates/${id(number)}/verify`),
+
+  thesis: () => call("GET", "/thesis"),
+  useToken: (token) => localStorage.setItem(TOKEN, token),
+};
+
+export const links = {
+  live: (run) => `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${ROOT}/runs/${id(run)}/live${query({ lang: language })}`,
+  recording: (recording, kind = "csv") => `${ROOT}/recordings/${id(recording)}.${kind}`,
+  document: (number, kind) => `${ROOT}/certificates/${id(number)}.${kind}${kind === "pdf" ? query({ lang: language }) : ""}`,
+  run: (run) => `/run.html${query({ id: run })}`,
+  board: (board) => `/boards.html${query({ id: board })}`,
+  compare: (a, b) => `/compare.html${query({ a, b })}`,
+};

@@ -1,0 +1,37 @@
+// Making elements. Values never become markup: text is text.
+
+export const $ = (selector, root = document) => root.querySelector(selector);
+
+/** h("td", {class: "n"}, "5.9"): an element with attributes, on… handlers and children (null is left out). */
+export function h(tag, attributes = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else if (value === true) node.setAttribute(name, "");
+    else if (value !== false && value != null) node.setAttribute(name, value);
+  }
+  node.append(...children.flat().filter((child) => child != null));
+  return node;
+}
+
+/** A table from head cells and rows; a cell is text, a node or {n: text} for a number set right. `label` names it. */
+export function table(head, rows, { label, compact = false } = {}) {
+  const cell = (tag, content, scope) => {
+    const isNumber = content?.n !== undefined;
+    return h(tag, { class: [isNumber && "n", content?.class].filter(Boolean).join(" ") || null, scope }, isNumber ? content.n : content);
+  };
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": label },
+    h("table", { class: compact ? "compact" : null },
+      h("thead", {}, h("tr", {}, head.map((content) => cell("th", content, "col")))),
+      h("tbody", {}, rows.map(([first, ...rest]) =>
+        h("tr", {}, cell("th", first, "row"), rest.map((content) => cell("td", content)))))));
+}
+
+export const facts = (pairs) =>
+  h("dl", { class: "facts" }, pairs.filter(([, value]) => value != null && value !== "").flatMap(
+    ([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+
+/** Puts the sentence of a problem near what caused it (and empties it again). */
+export function say(place, problem) {
+  place.textContent = problem ? problem.message : "";
+}

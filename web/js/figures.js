@@ -1,0 +1,22 @@
+// The certified figures of an axis: the server's one list of them (name, unit, digits), written for tables.
+
+import { api } from "./api.js";
+import { fixed, t, withUncertainty } from "./text.js";
+
+let fields = null;
+export const loadFigures = async () => { fields ??= (await api.fields()).items; };
+
+const at = (axis, path) => path.reduce((node, key) => node?.[key], axis);
+
+/** [{path, name, unit, text, value}] of one axis (CONTRACT 3 `axes`), or of one state's part of it with `under`. */
+export function figures(axis, under = null) {
+  return fields.filter(({ path }) => !under || path[0] === under).map(({ path, text, unit, factor, decimals }) => {
+    const entry = at(axis, path);
+    const measured = decimals == null;
+    const value = measured ? entry?.value : entry;
+    return {
+      path, unit, value: value == null ? null : value * factor, name: t(text),
+      text: value == null ? "–" : measured ? withUncertainty(value * factor, entry.standard_uncertainty * factor) : fixed(value * factor, decimals),
+    };
+  });
+}

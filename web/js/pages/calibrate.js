@@ -1,0 +1,190 @@
+// Calibrate: prepare, start, watch, leave with the certificate.
+
+import { api, links } from "../api.js";
+import { $, facts, h, say } from "../dom.js";
+import { loadFigures } from "../figures.js";
+import { watch } from "../live.js";
+import { livePlots } from "../plots.js";
+import { resultCard, stateName } from "../results.js";
+import { Setup } from "../setup.js";
+import { notice, page } from "../shell.js";
+import { STATES, showStates } from "../states.js";
+import { duration, sentence, t } from "../text.js";
+
+const FRAME_MS = 48;   // 20 pictures a second, no more
+const PLAN_AFTER_MS = 300;
+
+let setup;
+let watched = null;    // id of the run on the page
+let isStarting = false;
+
+page("calibrate", async () => {
+  setup = new Setup($("#setup"), { onStart: start, onChange: planSoon });
+  document.addEventListener("rig-changed", ({ detail }) => {
+    // A run that another browser or the command line started belongs on this page too.
+    if (detail.run && detail.run !== watched && !isStarting) follow(detail.run);
+  });
+  $("#stop-run").addEventListener("click", async () => {
+    say($("#about-error"), null);
+    try { await api.stopRun(watched); } catch (problem) { say($("#about-error"), problem); }
+  });
+  showIdle();
+  await Promise.all([setup.load(), loadFigures()]);
+  const asked = new URLSearchParams(location.search).get("run");
+  if (asked) await follow(asked);
+  else plan();
+});
+
+// --- before the run ---------------------------------------------------------------------------------------------
+
+function showIdle() {
+  $("#headline").textContent = t("calibrate.ready");
+  $("#next").textContent = t("calibrate.ready_next");
+  showStates($("#states"), STATES.map((name) => ({ name, status: "waiting" })));
+}
+
+let planTimer;
+function planSoon() {
+  setup.refuse(null);
+  clearTimeout(planTimer);
+  planTimer = setTimeout(plan, PLAN_AFTER_MS);
+}
+
+/** Asks what would happen, so that a refusal is read before Start is pressed. */
+async function plan() {
+  if (watched) return;
+  try {
+    const body = await setup.body();
+    const planned = await api.plan({ ...body, board: body.board || "board" });
+    if (watched) return;
+    showStates($("#states"), planned.states.map((state) => ({ ...state, status: "waiting" })));
+    $("#left").textContent = t("calibrate.bench_time", { duration: duration(planned.seconds) });
+    setup.refuse(null);
+  } catch (problem) {
+    setup.refuse(problem);
+  }
+}
+
+async function start() {
+  clearTimeout(planTimer);
+  setup.refuse(null);
+  isStarting = true;
+  $("#start").disabled = true;
+  try {
+    const run = await api.start(await setup.body());
+    follow(run.id);
+  } catch (problem) {
+    setup.refuse(problem, { focus: true });
+  } finally {
+    isStarting = false;
+    $("#start").disabled = false;
+  }
+}
+
+// --- the run ----------------------------------------------------------------------------------------------------
+
+let leave = () => {};
+
+async function follow(id) {
+  if (watched === id) return;
+  leave();
+  watched = id;
+  const run = await api.run(id);
+  const models = setup.models.length ? setup.models : (await api.gyroModels()).items;
+  $("#setup").hidden = true;
+  $("#mounting").hidden = true;
+  $("#about").hidden = false;
+  $("#live").hidden = false;
+  $("#stop-run").hidden = false;
+  $("#documents").replaceChildren();
+  $("#results").replaceChildren();
+  $("#about-facts").replaceChildren(facts([
+    [t("setup.board"), h("a", { href: links.board(run.board) }, run.board)], [t("setup.model"), models.find((m) => m.id === run.gyro_model)?.name ?? run.gyro_model],
+    [t("setup.profile"), t(`profile.${run.profile}`)], [t("setup.operator"), run.operator], [t("setup.note"), run.note],
+    [t("setup.readings"), run.readings], [t("rig.rig"), run.rig], [t("run.seed"), run.seed == null ? null : String(run.seed)],
+  ]));
+  const plots = livePlots($("#charts"), models.find((model) => model.id === run.gyro_model));
+  const names = run.states.map((state) => state.name);
+  const shownResults = new Map();
+  let latest = null;
+  let timer = null;
+
+  function draw() {
+    timer = null;
+    const soFar = latest;
+    plots.show(soFar);
+    showProgress(names, soFar);
+  }
+
+  function showResults(results) {
+    for (const [state, result] of Object.entries(results)) {
+      const text = JSON.stringify(result);
+      if (shownResults.get(state) === text) continue;
+      shownResults.set(state, text);
+      const card = resultCard(state, result);
+      const old = $(`#result-${state}`);
+      if (old) old.replaceWith(card); else $("#results").append(card);
+    }
+  }
+
+  const unwatch = watch(id, {
+    onFrame(soFar) {
+      latest = soFar;
+      timer ??= setTimeout(() => requestAnimationFrame(draw), FRAME_MS);
+      showResults(soFar.results);
+      if (soFar.ended) end(id);
+    },
+    onConnection: (text) => notice("live", text, "fail"),
+  });
+  leave = () => { unwatch(); plots.destroy(); clearTimeout(timer); };
+}
+
+function showProgress(names, soFar) {
+  const progress = soFar.progress ?? {};
+  if (soFar.ended) return;
+  const at = names.indexOf(soFar.state);
+  showStates($("#states"), names.map((name, i) => ({
+    name, fraction: progress.state_fraction, status: i < at ? "done" : i === at ? "running" : "waiting",
+  })));
+  $("#headline").textContent = soFar.state ? `${STATES.indexOf(soFar.state) + 1} ${stateName(soFar.state)}` : t("calibrate.starting");
+  $("#left").textContent = [
+    progress.of ? t("calibrate.done_of", { done: progress.done, of: progress.of }) : null,
+    progress.seconds_left == null ? null : t("calibrate.left", { duration: duration(progress.seconds_left) }),
+  ].filter(Boolean).join(" · ");
+  $("#next").textContent = soFar.state ? t(`calibrate.what_${soFar.state.split("_")[0]}`) : "";
+}
+
+/** The run is over, in whatever way: the sentence, the documents, the next step. */
+async function end(id) {
+  const run = await api.run(id);
+  if (watched !== id) return;
+  $("#stop-run").hidden = true;
+  $("#left").textContent = run.duration_s == null ? "" : t("calibrate.took", { duration: duration(run.duration_s) });
+  showStates($("#states"), run.states);
+  for (const state of run.states) {
+    if (state.result && !$(`#result-${state.name}`)) $("#results").append(resultCard(state.name, state.result));
+  }
+  const number = run.certificate;
+  const certificate = number ? await api.certificate(number).catch(() => null) : null;
+  $("#headline").textContent = number ? t(`calibrate.certificate_${certificate?.verdict ?? "issued"}`, { board: run.board, number }) : t(`calibrate.${run.status}`, { board: run.board });
+  $("#next").textContent = run.message ? sentence(run.message) : t(number ? "calibrate.certificate_next" : "calibrate.ended_next");
+  const documents = number ? ["pdf", "csv", "json"].map((kind, i) => h("a", { class: `button ${i ? "" : "main"}`, href: links.document(number, kind), download: "" }, t(`document.${kind}`))) : [];
+  $("#documents").replaceChildren(
+    ...documents,
+    h("a", { class: "button", href: links.run(id) }, t("calibrate.open_run")),
+    h("button", { type: "button", id: "again", onclick: again }, t("calibrate.again")),
+  );
+}
+
+function again() {
+  leave();
+  leave = () => {};
+  watched = null;
+  history.replaceState(null, "", "/");
+  for (const [name, hidden] of [["#setup", false], ["#mounting", false], ["#about", true], ["#live", true]]) $(name).hidden = hidden;
+  for (const name of ["#documents", "#results"]) $(name).replaceChildren();
+  $("#left").textContent = "";
+  showIdle();
+  plan();
+  $("#board").focus();
+}

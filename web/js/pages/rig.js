@@ -1,0 +1,36 @@
+// Rig: which one, what of it answers, what to do about the rest, and who holds it.
+
+import { api } from "../api.js";
+import { facts, h, say, table } from "../dom.js";
+import { rigCard } from "../rig_card.js";
+import { page, rigSentence } from "../shell.js";
+import { plain, t, when } from "../text.js";
+
+page("rig", async (main) => {
+  const state = h("p", { class: "muted" });
+  const card = h("section", { class: "panel stack" });
+  const limits = h("section", { class: "panel stack" });
+  const holder = h("section", { class: "panel stack" });
+  main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, limits, holder)));
+  const choose = rigCard(card, { full: true });
+
+  const name = h("input", { id: "holder", autocomplete: "name", maxlength: 100 });
+  const error = h("p", { class: "error", role: "alert" });
+  const told = h("p", {});
+  const attempt = (work) => async () => {
+    say(error, null);
+    try { await work(); document.dispatchEvent(new Event("rig-asked")); } catch (problem) { say(error, problem); }
+  };
+  holder.append(h("h2", {}, t("rig.holder_title")), told, h("div", {}, h("label", { for: "holder" }, t("rig.your_name")), name), error,
+    h("div", { class: "row" }, h("button", { type: "button", onclick: attempt(() => api.holdRig(name.value.trim())) }, t("rig.hold")),
+      h("button", { type: "button", onclick: attempt(() => api.releaseRig()) }, t("rig.release"))));
+
+  document.addEventListener("rig-changed", ({ detail: rig }) => {
+    state.textContent = rigSentence(rig);
+    choose.show(rig);
+    told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder, until: when(rig.lease.expires_at) }) : t("rig.no_lease");
+    limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
+      table(["", { n: t("rig.from") }, { n: t("rig.to") }, { n: t("rig.top_speed") }],
+        Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: `${plain(a.min_deg)}°` }, { n: `${plain(a.max_deg)}°` }, { n: `${plain(a.max_rate_dps)} deg/s` }]), { label: t("rig.limits") }));
+  });
+});

@@ -1,0 +1,104 @@
+// What every page has: the bar on top with the stop, the language, and one place for sentences about the whole page.
+
+import { api } from "./api.js";
+import { $, h } from "./dom.js";
+import { chooseLanguage, clock, language, loadTexts, t, translate } from "./text.js";
+
+const PAGES = [
+  ["calibrate", "/"], ["boards", "/boards.html"], ["certificates", "/certificates.html"],
+  ["compare", "/compare.html"], ["rig", "/rig.html"], ["thesis", "/thesis.html"],
+];
+const RIG_EVERY_MS = 5000;
+
+/** The stop comes first and needs nothing else of the page: no texts, no rig, no confirmation. */
+function stopButton() {
+  const button = h("button", { class: "stop", type: "button" }, "STOP");
+  button.addEventListener("click", async () => {
+    notice("stop", t("page.stopping"), "fail");
+    try {
+      await api.emergencyStop();
+      notice("stop", t("page.stopped", { time: clock() }), "fail");
+    } catch (problem) {
+      notice("stop", t("page.stop_failed", { reason: problem.message }), "fail");
+    }
+  });
+  return button;
+}
+
+/** A sentence about the whole page, under the bar, until another with the same name or null replaces it. */
+export function notice(name, text, kind = "") {
+  $(`#notices [data-name="${name}"]`)?.remove();
+  if (text) $("#notices").append(h("p", { class: `notice ${kind}`, "data-name": name, role: kind === "fail" ? "alert" : "status" }, text));
+}
+
+/** A problem of the whole page; where the server asks for its token, the place to type it. */
+export function fault(problem) {
+  notice("fault", problem.message ?? String(problem), "fail");
+  if (problem.status !== 401) return;
+  const field = h("input", { type: "password", "aria-label": t("page.token"), autocomplete: "off" });
+  $('#notices [data-name="fault"]').append(h("form", {
+    class: "row",
+    onsubmit: (event) => { event.preventDefault(); api.useToken(field.value.trim()); location.reload(); },
+  }, field, h("button", { type: "submit" }, t("page.use_token"))));
+}
+
+export function rigSentence(rig) {
+  const name = rig.simulated ? t("rig.simulated_at", { speed: speedWord(rig.speed) }) : rig.url;
+  const holder = api.holdsRig() ? t("rig.you_hold") : rig.lease ? t("rig.held_by", { holder: rig.lease.holder }) : t("rig.free");
+  return `${name} · ${rig.connected ? t("rig.connected") : t("rig.not_connected")} · ${holder}`;
+}
+
+export const speedWord = (speed) => (speed === "max" || speed === Infinity || speed === 0 ? t("rig.as_fast_as_possible") : `${speed}×`);
+
+/** Starts a page: bar, texts, the page's own work; then the rig every five seconds, told to `rig-changed` listeners. */
+export async function page(name, work) {
+  const who = h("p", { class: "who" });
+  const nav = h("nav", { id: "menu" });
+  const menu = h("button", {
+    class: "menu", type: "button", "aria-expanded": "false", "aria-controls": "menu",
+    onclick: () => menu.setAttribute("aria-expanded", String(nav.classList.toggle("open"))),
+  });
+  const languages = h("div", { class: "languages", role: "group" });
+  const stop = stopButton();
+  const skip = h("a", { class: "skip", href: "#content" });
+  document.body.prepend(
+    skip, h("header", { class: "bar" }, h("a", { class: "brand", href: "/" }, "Gyrobench"), menu, nav, who, languages, stop),
+  );
+  const main = $("main");
+  main.id = "content";
+  main.before(h("div", { id: "notices", "aria-live": "polite" }));
+
+  await loadTexts();
+  document.title = `${t(`page.${name}`)} · Gyrobench`;
+  stop.textContent = t("page.stop");
+  stop.setAttribute("aria-label", t("page.emergency_stop"));
+  menu.textContent = t("page.menu");
+  skip.textContent = t("page.skip");
+  nav.setAttribute("aria-label", t("page.pages"));
+  nav.append(...PAGES.map(([key, href]) => h("a", { href, "aria-current": key === name ? "page" : null }, t(`page.${key}`))));
+  languages.setAttribute("aria-label", t("page.language"));
+  languages.append(...[["en", "EN"], ["th", "ไทย"]].map(([code, word]) => h("button", {
+    type: "button", lang: code, "aria-pressed": String(code === language), onclick: () => chooseLanguage(code),
+  }, word)));
+  translate();
+  document.documentElement.dataset.ready = "";
+
+  async function lookAtRig() {
+    try {
+      const rig = await api.rig();
+      who.textContent = rigSentence(rig);
+      notice("rig", null);
+      document.dispatchEvent(new CustomEvent("rig-changed", { detail: rig }));
+    } catch (problem) {
+      notice("rig", problem.message, "fail");
+    }
+  }
+  document.addEventListener("rig-asked", lookAtRig);
+  setInterval(() => { if (!document.hidden) lookAtRig(); }, RIG_EVERY_MS);
+  try {
+    await Promise.all([work(main), lookAtRig()]);
+  } catch (problem) {
+    fault(problem);
+    if (!problem.status) throw problem;
+  }
+}
