@@ -33,6 +33,10 @@ class Move:
         way = self.to_deg - from_deg
         return from_deg + math.copysign(min(abs(way), travelled), way)
 
+    @property
+    def peak_rate_dps(self) -> float:
+        return self.rate_dps
+
 
 @dataclass(frozen=True)
 class Wave:
@@ -342,9 +346,10 @@ def check(plan: Plan, axes: Mapping[str, Axis], gyro_model: GyroModel | None = N
                 highest = max(motion.frequencies_hz)
                 if highest > MAX_FREQUENCY_HZ:
                     raise Problem("plan.frequency", axis=motion.axis, asked=highest, highest=MAX_FREQUENCY_HZ)
-                angles, rate = (motion.peak_deg, -motion.peak_deg), motion.peak_rate_dps
+                angles = (motion.peak_deg, -motion.peak_deg)
             else:
-                angles, rate = (motion.to_deg, motion.to_deg), motion.rate_dps
+                angles = (motion.to_deg, motion.to_deg)
+            rate = motion.peak_rate_dps
             sensor = model.axes.get(motion.axis)
             if sensor is not None and rate > sensor.range_dps:
                 raise Problem("plan.rate_past_sensor", axis=motion.axis, asked=rate, highest=sensor.range_dps,

@@ -1,0 +1,125 @@
+"""The twin: a simulated rig whose gyro is a `Model`. Turn the table and the voltage moves.
+
+Physics only: true time goes forward by whole samples in `advance`, nothing sleeps, every draw comes from the seed.
+The devices in front of it (`server/devices/twin_rig.py`) see what the real ones would: servo registers, codes, and
+readings stamped by the host's clock and by the DAQ's.
+"""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core.model import Model, Noise, Truth
+from calib_core.twin_daq import Daq, DaqSpec
+from calib_core.twin_servo import RX28, RX64, Servo, to_code, to_deg
+
+F64 = NDArray[np.float64]
+
+HOST_EPOCH_S = 5000.0  # the host's clock when true time is 0: nothing may rely on the clocks agreeing
+POLL_S = 0.0101  # the bus thread asks both servos at about 99 Hz, so rows at 100 Hz always have room for a reading
+ASK_S = 0.002  # one servo after the other
+POLL_JITTER_S = 0.0002
+LATCH_S = -0.0002  # when the servo looks at its encoder, from the middle of the transaction that the host stamps
+LATCH_JITTER_S = 0.0001
+
+
+def board_truth(seed: int, board: str = "") -> dict[str, Model]:
+    """The gyro of a simulated board: realistic and different for each seed and board id.
+
+    Bias 1.23–1.28 V, scale factor 5.7–6.1 mV/(deg/s), white noise of 1.2 mV at 100 Hz (0.12 mV/√Hz).
+    """
+    rng = np.random.default_rng([seed, zlib.crc32(board.encode()), 1])
+    return {
+        axis: Model(rng.uniform(1.23, 1.28), rng.uniform(5.7e-3, 6.1e-3), noise=Noise(white=1.2e-3)) for axis in "xz"
+    }
+
+
+@dataclass(frozen=True)
+class Samples:
+    """n samples: (n,) by the DAQ's own clock, (n, channels) in V, and when the host had them."""
+
+    time_s: F64
+    volts: F64
+    host_time_s: float
+
+
+class Plant:
+    """Table, gyro and DAQ.
+
+    `models` is the gyro's truth by axis (default: `board_truth(seed)`). `tilt`: the sensor's z sees a turn of the
+    table's z times cos θ_x. `covariates`: a third and fourth channel, an LM35 (10 mV/°C) and half of the supply.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        models: Mapping[str, Model] | None = None,
+        *,
+        tilt: bool = True,
+        covariates: bool = False,
+        start_deg: Mapping[str, float] | None = None,
+    ) -> None:
+        servo, daq, poll, self._noise = np.random.default_rng([seed, 2]).spawn(4)
+        where = start_deg or {"x": -3.0, "z": 8.0}
+        self.servos = {
+            axis: Servo(replace(spec, speed_error=servo.normal(0.0, 0.005)), servo, where[axis])
+            for axis, spec in (("x", RX28), ("z", RX64))
+        }
+        self.daq = Daq(DaqSpec(clock_error=daq.uniform(-5e-5, 5e-5)), daq)
+        self.tilt, self.covariates = tilt, covariates
+        self.now_s = 0.0
+        self._poll = poll
+        self._polls = 0
+        self.mount(models or board_truth(seed))
+
+    def mount(self, models: Mapping[str, Model]) -> None:
+        """Put this gyro on the table."""
+        self.models = dict(models)
+        rate = self.daq.spec.rate_hz
+        self._output = {axis: model.simulator(axis, rate, self._noise.spawn(1)[0]) for axis, model in models.items()}
+
+    @property
+    def host_time_s(self) -> float:
+        return HOST_EPOCH_S + self.now_s
+
+    def advance(self, n: int) -> Samples:
+        """The next n samples of every channel; true time goes on to when the last of them was taken."""
+        own, true = self.daq.times(n)
+        delay = self.daq.spec.channel_delay_s
+        at = {axis: true + i * delay for i, axis in enumerate(self._output)}
+        moved = {axis: servo.motion(at.get(axis, true)) for axis, servo in self.servos.items()}
+        rates = {axis: rate for axis, (_, rate) in moved.items()}
+        angles = {axis: angle for axis, (angle, _) in moved.items()}
+        if self.tilt and rates["z"].any():
+            rates["z"] = rates["z"] * np.cos(np.radians(angles["x"]))
+        temperature, supply = self._surroundings(true) if self.covariates else (None, None)
+        columns = [output(Truth(at[axis], rates, angles, temperature, supply)) for axis, output in self._output.items()]
+        if temperature is not None and supply is not None:
+            columns += [0.01 * temperature, 0.5 * supply]
+        volts = self.daq.convert(np.column_stack(columns))
+        self.now_s = float(true[-1])
+        return Samples(own, volts, self.host_time_s + self.daq.latency_s())
+
+    def _surroundings(self, true_s: F64) -> tuple[F64, F64]:
+        """Temperature (°C) and supply (V) around the board: a bench that warms by a degree in half an hour."""
+        noise = self._noise.standard_normal((2, len(true_s)))
+        temperature = 26.0 - np.exp(-true_s / 1800.0) + 0.1 * noise[0]
+        return temperature, 3.0 + 0.001 * noise[1]
+
+    def encoders(self) -> dict[str, tuple[F64, F64]]:
+        """What the bus thread has read since the last call: per axis host times (m,) and angles (m,)."""
+        until = int((self.now_s - 2.0 * ASK_S) / POLL_S)
+        n = max(0, until - self._polls)
+        asked = (self._polls + 1 + np.arange(n)) * POLL_S + POLL_JITTER_S * self._poll.random(n)
+        self._polls += n
+        read = {}
+        for i, (axis, servo) in enumerate(self.servos.items()):
+            middle = asked + (i + 0.5) * ASK_S
+            latched = middle + LATCH_S + LATCH_JITTER_S * self._poll.standard_normal(n)
+            # The jitter is far below the 10 ms between polls, so these times increase.
+            read[axis] = HOST_EPOCH_S + middle, to_deg(to_code(servo.motion(latched)[0]))
+            servo.forget(self._polls * POLL_S)
+        return read

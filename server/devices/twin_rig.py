@@ -1,0 +1,87 @@
+"""`twin:`, the simulated rig: a table and a DAQ in front of one `Plant`.
+
+Reading n samples is what makes time pass, so nothing waits and a test sleeps nowhere.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib_core.sequence import Axis, Motion
+from calib_core.twin import Plant
+from calib_core.twin_servo import STEP_DEG
+from server.devices import DeviceError, streaming
+from server.devices.protocols import Readings, Samples, Telemetry
+
+
+class TwinTable:
+    """Two simulated servos. `silent` axes do not answer, as with a pulled cable."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.silent: set[str] = set()
+        self.axes: Mapping[str, Axis] = {
+            axis: Axis(axis, -150.0, 150.0, servo.spec.top_rate_dps, STEP_DEG, servo.spec.part, servo.spec.supply_V)
+            for axis, servo in plant.servos.items()
+        }
+
+    def open(self) -> None:
+        for axis in self.silent:
+            raise DeviceError("rig.servo_silent", axis=axis, part=self.axes[axis].part)
+
+    def start(self, motions: Sequence[Motion]) -> None:
+        now = self.plant.now_s
+        for motion in motions:
+            goals = ((now + t, *streaming.goal(motion, 0.0, t - motion.start_s)) for t in streaming.times(motion))
+            self.plant.servos[motion.axis].command(goals)
+
+    def read(self) -> dict[str, Readings]:
+        read = {axis: Readings(*arrays) for axis, arrays in self.plant.encoders().items()}
+        for axis in self.silent:
+            read[axis] = Readings(np.empty(0), np.empty(0))
+        return read
+
+    def telemetry(self) -> dict[str, Telemetry]:
+        return {
+            axis: Telemetry(servo.spec.supply_V, 34.0, 0.0, servo.torque_on)
+            for axis, servo in self.plant.servos.items()
+        }
+
+    def safe(self) -> None:
+        for servo in self.plant.servos.values():
+            servo.stop(self.plant.now_s)
+
+    def close(self) -> None:
+        self.safe()
+
+
+class TwinDaq:
+    """The simulated converter. `unplugged`: it gives no more samples, as with a pulled cable."""
+
+    part = "NI USB-6008"
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.unplugged = False
+        self.rate_hz = plant.daq.spec.rate_hz
+        self.channel_delay_s = plant.daq.spec.channel_delay_s
+        more = ("temperature_c", "supply_v") if plant.covariates else ()
+        self.channels: tuple[str, ...] = ("x_gyro_v", "z_gyro_v", *more)
+
+    def open(self) -> None:
+        if self.unplugged:
+            raise DeviceError("rig.daq_silent", part=self.part)
+
+    def start(self) -> None:
+        self.plant.daq.start(self.plant.now_s + 1.0 / self.rate_hz)
+
+    def read(self, n: int) -> Samples:
+        if self.unplugged:
+            raise DeviceError("rig.daq_silent", part=self.part)
+        return self.plant.advance(n)
+
+    def safe(self) -> None:
+        """Nothing runs between reads."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
