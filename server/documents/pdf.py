@@ -253,11 +253,14 @@ def _statements(content: Mapping[str, Any], lang: str) -> Iterator[tuple[str, st
     def say(key: str, **values: object) -> str:
         return render(f"certificate.{key}", values, lang)
 
+    named: dict[str, str] = {}
     yield "method", " ".join([say(f"method.{content['profile']}"), say("method.tests")])
-    sources = {entry["name"]: None for state in content["states"].values() for entry in state.get("budget", ())}
-    included = ", ".join(render(f"budget.{name}", {}, lang) for name in sources) or "–"
-    yield "uncertainty", " ".join([say("uncertainty.included", sources=included), say("uncertainty.excluded")])
-    calibrated = content["rig"]["reference"]
-    reference = "uncalibrated" if calibrated in (None, "", "not calibrated") else "calibrated"
+    budgets = [rows for state in content["states"].values() for rows in state.get("budget", {}).values()]
+    for part, excluded in (("included", False), ("excluded", True)):
+        names = dict.fromkeys(row["name"] for rows in budgets for row in rows if row.get("excluded", False) == excluded)
+        named[part] = ", ".join(render(f"budget.{name}", {}, lang) for name in names) or "–"
+    yield "uncertainty", " ".join([say("uncertainty.included", **named), say("uncertainty.excluded", **named)])
+    calibrated = content["rig"]["reference_calibration"]
+    reference = "calibrated" if calibrated else "uncalibrated"
     yield "traceability", say(f"traceability.{reference}", reference=inert(calibrated))
     yield "scope", " ".join([say("scope.items"), *([say("scope.rule")] if content["spec"] else [])])
