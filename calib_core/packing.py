@@ -115,7 +115,7 @@ def unpack_recording(blob: bytes) -> Recording:
 
 def _planes(values: npt.NDArray[Any]) -> bytes:
     """All first bytes, then all second bytes, …: bytes of one weight resemble one another."""
-    return np.ascontiguousarray(values.view(np.uint8).reshape(len(values), -1).T).tobytes()
+    return np.ascontiguousarray(values.view(np.uint8).reshape(-1, values.itemsize).T).tobytes()
 
 
 def _together(planes: bytes, dtype: str) -> npt.NDArray[Any]:

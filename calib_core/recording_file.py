@@ -121,9 +121,10 @@ def _cells(text: str, line: int) -> list[str]:
 def _add_header(header: dict[str, str], text: str, line: int) -> None:
     """``# key: value``; a spreadsheet quotes such a line and fills it up with commas. Repeated keys are joined."""
     text = _cells(text, line)[0] if text.startswith('"') else text.rstrip(",")
-    key, colon, value = text.lstrip("#").partition(":")
-    key, value = (key.strip(), value.strip()) if colon else ("comment", key.strip())
-    if value:
+    key, colon, value = (part.strip() for part in text.lstrip("#").partition(":"))
+    if not colon:
+        key, value = "comment", key
+    if value or (colon and key):
         header[key] = f"{header[key]}; {value}" if key in header else value
 
 
@@ -174,16 +175,13 @@ def _fast(table: TextTable, names: Sequence[str]) -> Recording | None:
 
 def rows(table: TextTable) -> Iterator[tuple[int, list[str]]]:
     """Each row that is not blank with the line it begins on; raises Problem where the text breaks off."""
-    text = io.TextIOWrapper(io.BytesIO(table.body), encoding="utf-8", newline="")
-    reader = csv.reader(text)
+    reader = csv.reader(_text(piece.group(), i) for i, piece in enumerate(_LINE.finditer(table.body), table.line))
     while True:
         line = table.line + reader.line_num
         try:
             cells = next(reader)
         except StopIteration:
             return
-        except UnicodeDecodeError:
-            raise Problem("recording.not_text", line=line) from None
         except csv.Error:
             raise Problem("recording.broken_row", line=line) from None
         if not any(cell.strip() for cell in cells) and len(cells) < 2:
@@ -244,7 +242,7 @@ def write(recording: Recording, file: BinaryIO) -> None:
     names = ["time_s", *recording.columns]
     columns = [pa.array(values, from_pandas=True) for values in (recording.time_s, *recording.columns.values())]
     quoting = "none"
-    if any(recording.segment_names):
+    if recording.where(bool).any():
         names.append("segment")
         columns.append(pa.array(recording.segment_names, pa.string()).take(pa.array(recording.segment_codes)))
         if any(set(',"') & set(name) for name in recording.segment_names):

@@ -65,7 +65,7 @@ def write(recording: Recording, file: BinaryIO) -> None:
         name: pa.array(values, from_pandas=True)
         for name, values in [("time_s", recording.time_s), *recording.columns.items()]
     }
-    if any(recording.segment_names):
+    if recording.where(bool).any():
         columns["segment"] = pa.DictionaryArray.from_arrays(
             pa.array(recording.segment_codes, pa.int32()), pa.array(recording.segment_names, pa.string())
         )
