@@ -24,7 +24,9 @@ FILTERPY_LIMIT_V = 1e-9
 CLOCK_ERROR = 5e-5
 """Half-width of the DAQ clock's relative error: angles are the servo's, so its seconds go straight into S."""
 NOISE_GREW = 2.0
-"""Innovation variance over the one the gain was made for, past which the fixed gain no longer fits (METHOD 1)."""
+"""Noise density in motion over the one at rest past which a fixed gain is wrong (METHOD 1)."""
+LEAST_REST = 50
+"""Rows of a hold that tell its noise."""
 LEAST_ANSWER = 0.2
 """A scale factor below this part of the datasheet's is a gyro that is not connected, not a bad one."""
 # Real, and of unknown size on a rig without calibration records of its own: named, never guessed.
@@ -173,7 +175,9 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
     _check_answer(fit, axis, gyro_model)
     hold = whole.gyro(axis).values[: len(whole) - len(motion)]
     interval_s = float(np.median(np.diff(motion.time_s)))
-    rest_density = kalman.noise_density(hold, interval_s) if np.isfinite(hold).sum() > 50 else None
+    moving_density = kalman.noise_density(motion.gyro(axis).values, interval_s)
+    rested = np.isfinite(hold).sum() > LEAST_REST
+    rest_density = kalman.noise_density(hold, interval_s) if rested else moving_density
     datasheet = gyro_model.axes[axis]
     v = motion.gyro(axis)
     adaptive = adaptation.estimate(
@@ -188,7 +192,7 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
     difference = kalman.filterpy_difference(v.values[:1000], interval_s, adaptive.gain)
     budgets = _budgets(fit, adaptive, profile)
     warnings = [dict(warning) for warning in fit.warnings]
-    warnings += _filter_warnings(difference, adaptive.whiteness)
+    warnings += _filter_warnings(difference, moving_density / rest_density)
     if fit.scale_factor * datasheet.scale_factor_V_per_dps < 0:
         warnings.append({"code": "session.reversed", "values": {"axis": axis}})
     try:
@@ -224,7 +228,7 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
                 "k1": adaptive.gain.k1,
                 "k2": adaptive.gain.k2,
                 "whiteness_p": adaptive.whiteness.p,
-                "variance_ratio": adaptive.whiteness.variance_ratio,
+                "noise_ratio": moving_density / rest_density,
                 "filterpy_difference": difference,
             },
             "step_check": step and step.to_json(),
@@ -286,12 +290,12 @@ def _delay(fit: integral_fit.Fit) -> Result | None:
     return {"value": fit.delay_s, "standard_uncertainty": u, "expanded_uncertainty": 1.96 * u}
 
 
-def _filter_warnings(difference_V: float, whiteness: kalman.Whiteness) -> list[Result]:
+def _filter_warnings(difference_V: float, noise_ratio: float) -> list[Result]:
     told: list[Result] = []
     if not difference_V <= FILTERPY_LIMIT_V:
         told.append({"code": "session.filterpy", "values": {"difference_V": difference_V, "limit_V": FILTERPY_LIMIT_V}})
-    if whiteness.variance_ratio > NOISE_GREW:
-        told.append({"code": "session.noise_grew", "values": {"ratio": whiteness.variance_ratio}})
+    if noise_ratio > NOISE_GREW:
+        told.append({"code": "session.noise_grew", "values": {"ratio": noise_ratio}})
     return told
 
 
