@@ -5,10 +5,13 @@ Raw facts only: fits are made from what was stored. However it ends – done, st
 generator – the rig is left safe.
 """
 
+import itertools
+import json
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -19,7 +22,7 @@ from calib_core import sequence
 from calib_core.problem import Problem
 from calib_core.recording import Recording
 from calib_core.sequence import Plan, State
-from server.devices import DeviceError
+from server import __version__
 from server.devices.rig import ROW_S, Rig
 
 F64 = NDArray[np.float64]
@@ -39,7 +42,7 @@ class Abort(Protocol):
 class Pacer:
     """Lets bench time go `speed` times as fast as the clock; infinity waits for nothing, as does hardware at 1."""
 
-    def __init__(self, speed: float = np.inf, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, speed: float = math.inf, clock: Callable[[], float] = time.monotonic) -> None:
         if not speed > 0.0:
             raise Problem("rig.speed", given=speed)
         self.speed, self._clock = speed, clock
@@ -53,7 +56,7 @@ class Pacer:
 
     def wait(self, bench_s: float, abort: Abort) -> None:
         """Wait until `bench_s` more of bench time may have passed, or abort."""
-        if np.isinf(self.speed):
+        if math.isinf(self.speed):
             return
         now = self._clock()
         # What a slow consumer lost is caught up, but never more than one block of it.
@@ -134,6 +137,9 @@ class Stop(Document):
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
+Documents = Generator[Document, None, None]
+
+
 class Aborted(Exception):
     """The operator stopped the run."""
 
@@ -148,14 +154,19 @@ def run(
     abort: Abort | None = None,
     pace: Pacer | None = None,
     clock: Callable[[], float] = time.time,
-) -> Iterator[Document]:
+) -> Documents:
     """Run the plan. `header` is added to the recording's; `clock` gives the documents' times.
 
-    The whole plan is checked against the rig before the first document: `Problem` is raised, nothing has moved.
+    Without `pace` a simulated rig runs as fast as it can, a real one at its own time, which is the only one it has.
+    The whole plan is checked against the rig before anything else: `Problem` is raised and nothing has moved.
     After that a failure ends the run with a `Stop` that says what happened, and is not raised.
     """
+    if pace is None:
+        pace = Pacer(math.inf if rig.simulated else 1.0)
+    if pace.speed != 1.0 and not rig.simulated:
+        raise Problem("rig.speed_fixed", given=pace.speed)
     sequence.check(plan, rig.axes)
-    return _run(plan, rig, run_id, board, header or {}, abort or threading.Event(), pace or Pacer(), clock)
+    return _run(plan, rig, run_id, board, header or {}, abort or threading.Event(), pace, clock)
 
 
 def _run(
@@ -167,36 +178,46 @@ def _run(
     abort: Abort,
     pace: Pacer,
     clock: Callable[[], float],
-) -> Iterator[Document]:
-    seq = -1
+) -> Documents:
+    numbers = itertools.count()
 
     def stamp() -> dict[str, Any]:
-        nonlocal seq
-        seq += 1
-        return {"run": run_id, "seq": seq, "time": clock()}
+        return {"run": run_id, "seq": next(numbers), "time": clock()}
 
     outcome: dict[str, Any] = {"status": "finished"}
     try:
         yield Start(**stamp(), plan=plan.to_json(), seed=plan.seed, duration_s=plan.duration_s)
         rig.mount(board)
         rig.begin()
-        yield Descriptor(**stamp(), columns=rig.columns, rate_hz=1.0 / ROW_S, header=_header(plan, rig, board, header))
-        done_s = 0.0
+        described = {**_header(plan, board), **rig.header, **header}
+        yield Descriptor(**stamp(), columns=rig.columns, rate_hz=1.0 / ROW_S, header=described)
+        before_s = 0.0
         for index, state in enumerate(plan.states):
             yield StateBegin(
                 **stamp(), state=state.name, index=index, axis=state.axis, kind=state.kind, readings=state.readings,
                 duration_s=state.duration_s,
             )  # fmt: skip
-            for segment, columns, fast, in_state_s, readings in _state(state, rig, abort, pace):
-                progress = Progress(
-                    done=readings,
-                    of=state.readings,
-                    state_fraction=in_state_s / state.duration_s,
-                    run_fraction=(done_s + in_state_s) / plan.duration_s,
-                    seconds_left=plan.duration_s - done_s - in_state_s,
-                )
-                yield Rows(**stamp(), state=state.name, segment=segment, columns=columns, progress=progress, fast=fast)
-            done_s += state.duration_s
+            done, done_s = 0, 0.0
+            for step in state.steps:
+                yield from (
+                    Rows(**stamp(), state=state.name, segment="rest", columns=block.columns,
+                         progress=_progress(plan, state, before_s, done_s, done))
+                    for block in rig.waiting()
+                )  # fmt: skip
+                rig.start(step.motions)
+                for seconds in _blocks(step.duration_s, pace.block_s):
+                    if abort.is_set():
+                        raise Aborted
+                    block = rig.read(seconds)
+                    done_s += seconds
+                    yield Rows(
+                        **stamp(), state=state.name, segment=step.segment, columns=block.columns,
+                        progress=_progress(plan, state, before_s, done_s, done),
+                        fast=block.fast if step.keep_fast else None,
+                    )  # fmt: skip
+                    pace.wait(seconds, abort)
+                done += "/" in step.segment
+            before_s += state.duration_s
             yield StateEnd(**stamp(), state=state.name, index=index)
     except Aborted:
         outcome = {"status": "stopped", "code": "run.stopped"}
@@ -207,37 +228,34 @@ def _run(
         outcome = {"status": "failed", "code": "internal",
                    "values": {"kind": type(error).__name__, "detail": str(error)}}  # fmt: skip
     finally:
+        # Also when the consumer closes the generator; then nothing may be yielded any more.
         try:
             rig.safe()
-        except DeviceError as fault:
+        except Exception as error:
             log.exception("run %s: the rig could not be made safe", run_id)
-            outcome = {"status": "failed", "code": "rig.not_safe", "values": {"reason": fault.code}}
+            outcome = {"status": "failed", "code": "rig.not_safe", "values": {"reason": str(error)}}
     yield Stop(**stamp(), **outcome)
 
 
-_Part = tuple[str, Mapping[str, F64], Mapping[str, F64] | None, float, int]
+def _blocks(duration_s: float, block_s: float) -> Iterator[float]:
+    """A step's duration in blocks of whole rows, the last one shorter."""
+    rows, of_block = round(duration_s / ROW_S), round(block_s / ROW_S)
+    for first in range(0, rows, of_block):
+        yield min(of_block, rows - first) * ROW_S
 
 
-def _state(state: State, rig: Rig, abort: Abort, pace: Pacer) -> Iterator[_Part]:
-    """Blocks of one state: segment, columns, fast samples where they are kept, bench time and readings so far."""
-    in_state_s, readings = 0.0, 0
-    for step in state.steps:
-        rig.start(step.motions)
-        left_s = step.duration_s
-        while left_s > ROW_S / 2:
-            if abort.is_set():
-                raise Aborted
-            seconds = min(pace.block_s, left_s)
-            block = rig.read(seconds)
-            left_s -= seconds
-            in_state_s += seconds
-            if left_s <= ROW_S / 2 and "/" in step.segment:
-                readings += 1
-            yield step.segment, block.columns, block.fast if step.keep_fast else None, in_state_s, readings
-            pace.wait(seconds, abort)
+def _progress(plan: Plan, state: State, before_s: float, done_s: float, readings: int) -> Progress:
+    return Progress(
+        done=readings,
+        of=state.readings,
+        state_fraction=done_s / state.duration_s,
+        run_fraction=(before_s + done_s) / plan.duration_s,
+        seconds_left=max(0.0, plan.duration_s - before_s - done_s),
+    )
 
 
-def _header(plan: Plan, rig: Rig, board: str, more: Mapping[str, str]) -> dict[str, str]:
+def _header(plan: Plan, board: str) -> dict[str, str]:
+    asked = plan.to_json()
     return {
         "format": "gyro-recording 1",
         "board": board,
@@ -246,9 +264,10 @@ def _header(plan: Plan, rig: Rig, board: str, more: Mapping[str, str]) -> dict[s
         "profile": plan.profile,
         "seed": str(plan.seed),
         "readings": str(plan.readings),
-        "states": ",".join(state.name for state in plan.states),
-        **rig.header,
-        **more,
+        "states": ",".join(asked["states"]),
+        "ranges": json.dumps(asked["ranges"]),
+        "gyro_model": json.dumps(asked["gyro_model"], ensure_ascii=False),
+        "software": f"gyrobench {__version__}",
     }
 
 
@@ -257,14 +276,15 @@ def record(plan: Plan, rig: Rig, **options: Any) -> Recording:
     header: Mapping[str, str] = {}
     blocks: list[Rows] = []
     for document in run(plan, rig, **options):
-        if isinstance(document, Descriptor):
-            header = document.header
-        elif isinstance(document, Rows):
-            blocks.append(document)
-        elif isinstance(document, Stop) and document.status != "finished":
-            raise Problem(document.code, **document.values)
-    codes: dict[str, int] = {}
-    counts = [len(block.columns["time_s"]) for block in blocks]
-    of_block = [codes.setdefault(block.segment, len(codes)) for block in blocks]
+        match document:
+            case Descriptor():
+                header = document.header
+            case Rows():
+                blocks.append(document)
+            case Stop() if document.status != "finished":
+                raise Problem(document.code, **document.values)
+    names: dict[str, int] = {}
+    codes = [names.setdefault(block.segment, len(names)) for block in blocks]
+    lengths = [len(block.columns["time_s"]) for block in blocks]
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
-    return Recording(columns.pop("time_s"), columns, np.repeat(of_block, counts).astype(np.int32), tuple(codes), header)
+    return Recording(columns.pop("time_s"), columns, np.repeat(codes, lengths).astype(np.int32), tuple(names), header)

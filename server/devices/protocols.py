@@ -74,6 +74,9 @@ class Daq(Protocol):
     def start(self) -> None:
         """Begin sampling; its clock is 0 at the first sample."""
 
+    def waiting(self) -> int:
+        """How many samples are there already, not yet read."""
+
     def read(self, n: int) -> Samples:
         """The next n samples; waits until they are there. Raises `DeviceError` when they do not come."""
 

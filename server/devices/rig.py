@@ -5,7 +5,7 @@ they belong to, each once, with its own time. A shaft that is not where it was s
 gyro that does not feel the table turn are found here.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ MEAN_OF = 10
 SCALES = {"temperature_c": 100.0, "supply_v": 2.0}  # an LM35, 10 mV/°C, and a divider by two
 STALL_DEG = 3.0
 STALL_LAG_S = 0.3  # a shaft may be this far behind its command
+LATE_S = 0.05
 SILENT_S = 0.5  # no reading of a servo for this long is a fault
 FELT_DPS, FELT_DEG, FELT_V = 20.0, 20.0, 0.015  # turned this fast and this far, the output must have moved this much
 
@@ -155,7 +156,7 @@ class Rig:
 
     def begin(self) -> None:
         """Start sampling at time zero, and see that every part answers before anything moves."""
-        if not self.connected:
+        if self._faults or not self.connected:
             self.open()
         self._forget()
         self.daq.start()
@@ -174,6 +175,12 @@ class Rig:
             shaft.low_V, shaft.high_V = np.inf, -np.inf
         if motions:
             self.table.start(motions)
+
+    def waiting(self) -> Iterator[Block]:
+        """Rows that came while nobody read: to be had before the next motion starts, or its segment would be late."""
+        rows = self.daq.waiting() // MEAN_OF
+        if rows * ROW_S >= LATE_S:
+            yield self.read(rows * ROW_S)
 
     def read(self, seconds: float) -> Block:
         """The next rows, `seconds` long (a multiple of 0.01 s); waits for them as long as they take.

@@ -75,6 +75,9 @@ class TwinDaq:
     def start(self) -> None:
         self.plant.daq.start(self.plant.now_s + 1.0 / self.rate_hz)
 
+    def waiting(self) -> int:
+        return 0
+
     def read(self, n: int) -> Samples:
         if self.unplugged:
             raise DeviceError("rig.daq_silent", part=self.part)
