@@ -68,7 +68,7 @@ export const api = {
 
   gyroModels: () => call("GET", `/gyro-models${query({ limit: 200 })}`),
   createGyroModel: (model) => call("POST", "/gyro-models", model),
-  changeGyroModel: (model) => call("PUT", `/gyro-models/${id(model.id)}`, model),
+  changeGyroModel: ({ id: model, preset: _, ...facts }) => call("PUT", `/gyro-models/${id(model)}`, facts),
   removeGyroModel: (model) => call("DELETE", `/gyro-models/${id(model)}`),
 
   boards: (q) => call("GET", `/boards${query(q)}`),

@@ -24,7 +24,7 @@ for (const query of ["(prefers-color-scheme: dark)", "print"]) {
 
 const groups = new Map();
 const DASH = { line: [], dash: [8, 5], dots: [2, 4] };
-const FONT = "12px system-ui, sans-serif";
+const FONT = "12px Sarabun, system-ui, sans-serif";
 
 const measure = document.createElement("canvas").getContext("2d");
 function widthOf(text) {
@@ -103,9 +103,9 @@ function drawBack(plot, spec, state) {
     ctx.fillRect(bbox.left, top, bbox.width, plot.valToPos(-state.band, "y", true) - top);
     ctx.fillStyle = colour("residual");
     ctx.font = FONT.replace("12px", `${12 * devicePixelRatio}px`);
-    ctx.textBaseline = "bottom";
+    ctx.textBaseline = "top";
     ctx.textAlign = "left";
-    ctx.fillText(state.note ?? "", bbox.left + 4 * devicePixelRatio, top - 1);
+    ctx.fillText(state.note ?? "", bbox.left + 4 * devicePixelRatio, top + 3 * devicePixelRatio);
   }
   if (spec.y.zero) {
     const zero = plot.valToPos(0, "y", true);
@@ -251,7 +251,11 @@ export function chart(place, spec) {
         plot.setScale("x", between());
       });
     },
-    rename(text) { name.textContent = text; },
+    rename(text, yLabel) {
+      name.textContent = text;
+      spec.y.label = yLabel;
+      if (plot) plot.axes[1].label = axisLabel(spec.y);
+    },
     destroy() {
       groups.get(group).delete(self);
       observer.disconnect();

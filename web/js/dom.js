@@ -14,17 +14,18 @@ export function h(tag, attributes = {}, ...children) {
   return node;
 }
 
-/** A table from head cells and rows; a cell is text, a node or {n: text} for a number set right. `label` names it. */
-export function table(head, rows, { label, compact = false } = {}) {
-  const cell = (tag, content, scope) => {
+/** A table from head cells and rows; a cell is text, a node or {n: text} for a number set right. `label` names it; `cards` makes each row a list on a phone. */
+export function table(head, rows, { label, compact = false, cards = false } = {}) {
+  const names = head.map((content) => content?.n ?? content);
+  const cell = (tag, content, attributes) => {
     const isNumber = content?.n !== undefined;
-    return h(tag, { class: [isNumber && "n", content?.class].filter(Boolean).join(" ") || null, scope }, isNumber ? content.n : content);
+    return h(tag, { class: [isNumber && "n", content?.class].filter(Boolean).join(" ") || null, ...attributes }, isNumber ? content.n : content);
   };
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": label },
-    h("table", { class: compact ? "compact" : null },
-      h("thead", {}, h("tr", {}, head.map((content) => cell("th", content, "col")))),
+    h("table", { class: [compact && "compact", cards && "cards"].filter(Boolean).join(" ") || null },
+      h("thead", {}, h("tr", {}, head.map((content) => cell("th", content, { scope: "col" })))),
       h("tbody", {}, rows.map(([first, ...rest]) =>
-        h("tr", {}, cell("th", first, "row"), rest.map((content) => cell("td", content)))))));
+        h("tr", {}, cell("th", first, { scope: "row" }), rest.map((content, i) => cell("td", content, { "data-label": names[i + 1] })))))));
 }
 
 export const facts = (pairs) =>

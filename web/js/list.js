@@ -22,7 +22,7 @@ export async function list(place, { load, head, row, label, empty }) {
     items = isFirst ? answer.items : [...items, ...answer.items];
     next = answer.next;
     more.hidden = next == null;
-    body.replaceChildren(items.length ? table(head, items.map(row), { label })
+    body.replaceChildren(items.length ? table(head, items.map(row), { label, cards: true })
       : search.value ? h("p", { class: "empty" }, t("list.nothing", { q: search.value })) : empty());
   }
   let timer;

@@ -13,7 +13,7 @@ const UNIT = { rate: "deg/s", position: "deg" };
 /** Scatter with line, and residual stems with their ±2σ band, for one rate or position test. */
 export function testCharts(place, kind) {
   const x = { label: t("chart.encoder"), unit: UNIT[kind], digits: 2, pad: true };
-  const height = 240;
+  const height = 220;
   const fitted = chart(place, {
     name: t(`chart.${kind}_points`), x, y: { label: t("chart.gyro"), unit: UNIT[kind], zero: true, digits: 3 }, height, waiting: t("chart.no_points"),
     series: [
@@ -36,7 +36,7 @@ export function testCharts(place, kind) {
       [row.reference, row.residual, null], ...row.readings.map((value) => [row.reference, null, value - row.fit]),
     ]));
     const band = twoSigma(rows);
-    residual.rename(t("chart.residual_name"));
+    residual.rename(t("chart.residual_name"), t("chart.residual"));
     residual.set(columns(flat, 3), { band, note: band ? t("chart.band_2sigma", { value: band, unit: UNIT[kind] }) : null });
   }
 
@@ -47,7 +47,7 @@ export function testCharts(place, kind) {
       [row.reference, row.bias_error_signed ?? row.mean - row.reference, null],
       ...row.readings.map((value, i) => [row.reference + width * (i / row.readings.length - 0.5), null, value - row.reference]),
     ]).sort((a, b) => a[0] - b[0]);
-    residual.rename(t("chart.repeat_name"));
+    residual.rename(t("chart.repeat_name"), t("chart.error"));
     residual.set(columns(flat, 3));
   }
 
@@ -65,7 +65,7 @@ const columns = (rows, n) => Array.from({ length: n }, (_, i) => rows.map((row) 
 
 function adaptiveCharts(place, model, axis) {
   const one = (key, unit, digits, least) => chart(place, {
-    name: t(`chart.adaptive_${key}`), group: "live", height: 240, waiting: t("chart.waiting"),
+    name: t(`chart.adaptive_${key}`), group: "live", height: 220, waiting: t("chart.waiting"),
     x: TIME(), y: { label: t(`chart.${key}`), unit, digits, least },
     series: [{ name: t("chart.estimate"), role: "model", draw: "line" }, { name: t("chart.datasheet"), role: "measured", draw: "dots" }],
   });
@@ -93,7 +93,7 @@ function adaptiveCharts(place, model, axis) {
 /** Everything that moves while a run goes on. show(run) redraws from a RunSoFar. */
 export function livePlots(place, model) {
   const rate = chart(place, {
-    name: t("chart.rate_name"), wide: true, group: "live", height: 240, waiting: t("chart.waiting"),
+    name: t("chart.rate_name"), wide: true, group: "live", height: 200, waiting: t("chart.waiting"),
     x: TIME(), y: { label: t("chart.rate"), unit: "deg/s", zero: true, digits: 2 },
     series: [{ name: t("chart.encoder"), role: "measured", draw: "line" }, { name: t("chart.gyro"), role: "model", draw: "dash" }],
   });
@@ -103,7 +103,7 @@ export function livePlots(place, model) {
   evidencePlace.className = "charts wide";
   place.append(evidencePlace);
   const signal = chart(place, {
-    name: t("chart.signal_name"), wide: true, group: "live", height: 180, waiting: t("chart.waiting"),
+    name: t("chart.signal_name"), wide: true, group: "live", height: 150, waiting: t("chart.waiting"),
     x: TIME(), y: { label: t("chart.output"), unit: "V", digits: 4, least: 0.005 },
     series: [{ name: t("chart.output"), role: "measured", draw: "line" }, { name: t("chart.filtered"), role: "model", draw: "dash" }],
   });

@@ -30,6 +30,16 @@ function estimateRows(result) {
   });
 }
 
+/** The two parameters of an axis in three short lines, for beside the plots. */
+export function estimateSummary(axis, result) {
+  const [bias, scale] = estimateRows(result);
+  return [
+    [axis, h("span", {}, h("span", { class: "muted small" }, `${bias[0]} `), bias[1].n)],
+    ["", h("span", {}, h("span", { class: "muted small" }, `${scale[0]} `), scale[1].n)],
+    ["", h("span", { class: "muted small" }, t("result.datasheet_says", { value: scale[4].n, off: scale[5].n }))],
+  ];
+}
+
 const ESTIMATE_HEAD = () => [t("result.parameter"), ...["certified", "expanded", "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
 
 export const warnings = (list) => (list ?? []).map((warning) => h("p", { class: "notice small" }, sentence(warning)));
@@ -45,10 +55,10 @@ function sampleSize(size, unit) {
 export function resultCard(state, result, { actions = [], level = "h2" } = {}) {
   const [kind] = split(state);
   const isEstimate = kind === "estimate";
-  return h("section", { class: `panel stack result ${isEstimate ? "wide" : ""}`, id: `result-${state}` },
+  return h("section", { class: `panel stack ${isEstimate ? "wide" : "test"}`, id: `result-${state}` },
     h("div", { class: "row spread" }, h(level, {}, stateName(state)), ...actions),
     isEstimate
-      ? table(ESTIMATE_HEAD(), estimateRows(result), { label: stateName(state) })
+      ? table(ESTIMATE_HEAD(), estimateRows(result), { label: stateName(state), cards: true })
       : table([t("result.figure"), { n: t("result.value") }],
         figures({ [kind]: result }, kind).map((row) => [`${row.name}, ${row.unit}`, { n: row.text }]), { compact: true, label: stateName(state) }),
     isEstimate ? null : sampleSize(result.sample_size, UNIT[kind]),

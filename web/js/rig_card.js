@@ -10,10 +10,9 @@ const WORD = (part) => (part.ok === null ? t("rig.unknown") : part.ok ? t("rig.o
 
 /** One line a part: a word with its mark; the sentence and the cure where something is wrong, or always when `full`. */
 export function partsList(parts, full = false) {
-  return h("ul", { class: "parts" }, parts.map((part) => h("li", { class: part.ok === null ? "" : part.ok ? "ok" : "bad" },
-    h("span", {}, t(`rig.part_${part.part.replace(" ", "_")}`)),
-    h("span", {}, h("span", { class: "word" }, WORD(part)),
-      part.ok === false || full ? h("span", { class: "small" }, ` ${[part.sentence, part.cure].filter(Boolean).join(" ")}`) : null))));
+  return h("ul", { class: full ? "parts full" : "parts" }, parts.map((part) => h("li", { class: part.ok === null ? "" : part.ok ? "ok" : "bad" },
+    h("span", { class: "name" }, t(`rig.part_${part.part.replace(" ", "_")}`)), " ", h("span", { class: "small" }, WORD(part)),
+    part.ok === false || full ? h("p", { class: "small" }, [part.sentence, part.cure].filter(Boolean).join(" ")) : null)));
 }
 
 /** Choice of rig, port and speed with the parts below; `show(rig)` fills it. A person's half-made choice is left alone. */
@@ -27,7 +26,7 @@ export function rigCard(place, { full = false } = {}) {
   const check = h("button", { type: "button", id: "rig-check" }, t("rig.check"));
   const field = (id, control, key) => h("div", {}, h("label", { for: id }, t(key)), control);
   const [portField, urlField, speedField] = [field("rig-port", port, "rig.port"), field("rig-custom", url, "rig.address"), field("rig-speed", speed, "rig.speed")];
-  place.replaceChildren(field("rig-url", choice, "rig.rig"), portField, urlField, speedField, parts, error, h("div", { class: "row" }, check));
+  place.replaceChildren(h("div", { class: "pair" }, field("rig-url", choice, "rig.rig"), speedField), portField, urlField, parts, error, h("div", { class: "row" }, check));
 
   const OTHER = "other:";
   let rig = null;

@@ -69,6 +69,8 @@ export async function page(name, work) {
   main.before(h("div", { id: "notices", "aria-live": "polite" }));
 
   await loadTexts();
+  // Before the first word and the first chart: a canvas does not wait for a face.
+  if (language === "th") await document.fonts.load("1rem Sarabun", "ก");
   document.title = `${t(`page.${name}`)} · Gyrobench`;
   stop.textContent = t("page.stop");
   stop.setAttribute("aria-label", t("page.emergency_stop"));

@@ -25,18 +25,17 @@ async function showBoards(main) {
 
 async function showBoard(main, id) {
   const board = await api.board(id);
-  const runs = board.last_runs ?? board.runs ?? [];
-  const certificates = board.last_certificates ?? board.certificates ?? [];
+  const { runs, certificates } = board;
   document.title = `${board.id} · Gyrobench`;
   main.append(
     h("h1", {}, board.id),
     facts([[t("boards.model"), board.gyro_model], [t("boards.note"), board.note], [t("boards.since"), when(board.created_at)]]),
     h("section", { class: "panel stack" }, h("h2", {}, t("boards.certificates")), certificates.length
-      ? table([t("certificates.number"), t("certificates.verdict"), t("certificates.issued"), t("certificates.documents")], certificates.map(certificateCells), { label: t("boards.certificates") })
+      ? table([t("certificates.number"), t("certificates.verdict"), t("certificates.issued"), t("certificates.documents")], certificates.map(certificateCells), { label: t("boards.certificates"), cards: true })
       : h("p", { class: "muted" }, t("boards.no_certificate"))),
     h("section", { class: "panel stack" }, h("h2", {}, t("boards.runs")), runs.length
-      ? table([t("run.started"), t("run.status"), t("setup.profile"), t("setup.operator")], runs.map((run) => [
-        h("a", { href: links.run(run.id) }, when(run.started_at ?? run.created_at)), t(`run.status_${run.status}`), t(`profile.${run.profile}`), run.operator ?? ""]), { label: t("boards.runs") })
+      ? table([t("run.started"), t("run.status"), t("setup.profile"), t("run.certificate")], runs.map((run) => [
+        h("a", { href: links.run(run.id) }, when(run.created_at)), t(`run.status_${run.status}`), t(`profile.${run.profile}`), run.certificate ?? ""]), { label: t("boards.runs"), cards: true })
       : h("p", { class: "muted" }, t("boards.no_run"))),
     h("p", { class: "row" }, h("a", { class: "button", href: links.compare(board.id, "") }, t("boards.compare"))),
   );

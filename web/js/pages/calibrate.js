@@ -5,7 +5,7 @@ import { $, facts, h, say } from "../dom.js";
 import { loadFigures } from "../figures.js";
 import { watch } from "../live.js";
 import { livePlots } from "../plots.js";
-import { resultCard, stateName } from "../results.js";
+import { estimateSummary, resultCard, split, stateName } from "../results.js";
 import { Setup } from "../setup.js";
 import { notice, page } from "../shell.js";
 import { STATES, showStates } from "../states.js";
@@ -72,7 +72,8 @@ async function start() {
   $("#start").disabled = true;
   try {
     const run = await api.start(await setup.body());
-    follow(run.id);
+    await follow(run.id);
+    $(".headline").scrollIntoView({ block: "nearest" });
   } catch (problem) {
     setup.refuse(problem, { focus: true });
   } finally {
@@ -96,6 +97,7 @@ async function follow(id) {
   $("#about").hidden = false;
   $("#live").hidden = false;
   $("#stop-run").hidden = false;
+  $(".work").classList.remove("ended");
   $("#documents").replaceChildren();
   $("#results").replaceChildren();
   $("#about-facts").replaceChildren(facts([
@@ -125,6 +127,8 @@ async function follow(id) {
       const old = $(`#result-${state}`);
       if (old) old.replaceWith(card); else $("#results").append(card);
     }
+    const estimates = [...shownResults.keys()].filter((state) => split(state)[0] === "estimate");
+    $("#summary").replaceChildren(facts(estimates.flatMap((state) => estimateSummary(split(state)[1], results[state]))));
   }
 
   const unwatch = watch(id, {
@@ -159,6 +163,7 @@ async function end(id) {
   const run = await api.run(id);
   if (watched !== id) return;
   $("#stop-run").hidden = true;
+  $(".work").classList.add("ended");
   $("#left").textContent = run.duration_s == null ? "" : t("calibrate.took", { duration: duration(run.duration_s) });
   showStates($("#states"), run.states);
   for (const state of run.states) {
@@ -182,7 +187,7 @@ function again() {
   watched = null;
   history.replaceState(null, "", "/");
   for (const [name, hidden] of [["#setup", false], ["#mounting", false], ["#about", true], ["#live", true]]) $(name).hidden = hidden;
-  for (const name of ["#documents", "#results"]) $(name).replaceChildren();
+  for (const name of ["#documents", "#results", "#summary"]) $(name).replaceChildren();
   $("#left").textContent = "";
   showIdle();
   plan();

@@ -25,7 +25,7 @@ async function showRuns(main) {
     load: (q) => api.runs({ ...q, limit: 50 }),
     label: t("run.runs"),
     head: [t("run.started"), t("setup.board"), t("run.status"), t("setup.profile")],
-    row: (run) => [h("a", { href: links.run(run.id) }, when(run.started_at ?? run.created_at)), run.board, t(`run.status_${run.status}`), t(`profile.${run.profile}`)],
+    row: (run) => [h("a", { href: links.run(run.id) }, when(run.created_at)), run.board, t(`run.status_${run.status}`), t(`profile.${run.profile}`)],
     empty: empty("boards.empty", "/", "boards.first"),
   });
 }
@@ -54,7 +54,7 @@ function showRun(main, run) {
 
   main.append(
     h("header", { class: "stack" },
-      h("h1", {}, t("run.title", { board: run.board, date: when(run.started_at) })),
+      h("h1", {}, t("run.title", { board: run.board, date: when(run.created_at) })),
       h("p", {}, run.message ? sentence(run.message) : t(`run.sentence_${run.status}`)),
       facts([[t("run.status"), t(`run.status_${run.status}`)], [t("setup.model"), run.gyro_model], [t("setup.profile"), t(`profile.${run.profile}`)],
         [t("setup.operator"), run.operator], [t("setup.note"), run.note], [t("setup.temperature"), run.conditions?.room_temperature_degC == null ? null : fixed(run.conditions.room_temperature_degC, 1)],
@@ -75,10 +75,10 @@ function showRun(main, run) {
   const results = Object.fromEntries(run.states.map(({ name, result }) => [name, result ?? run.results?.[name]]).filter(([, result]) => result));
   for (const [name, result] of Object.entries(results)) {
     const [kind, axis] = split(name);
-    const section = h("section", { class: "state-of-run stack" }, resultCard(name, result, { actions: [repeat(name)] }));
-    main.append(section);
-    if (kind === "estimate") comparison(section, run, axis);
-    else test(section, kind, result);
+    const card = resultCard(name, result, { actions: [repeat(name)] });
+    main.append(card);
+    if (kind === "estimate") comparison(card, run, axis);
+    else test(card, kind, result);
   }
   const missing = run.states.filter(({ name }) => !results[name]);
   if (missing.length && !isOn) {
@@ -87,19 +87,19 @@ function showRun(main, run) {
 }
 
 /** Thesis 4.17, 4.18, 5.7 to 5.9: rate and integrated angle against the encoder, with the datasheet's parameters and the estimated ones. */
-async function comparison(section, run, axis) {
-  const panel = h("div", { class: "panel stack" }, h("h3", {}, t("run.comparison", { axis })));
-  section.append(panel);
+async function comparison(card, run, axis) {
+  const place = h("div", { class: "stack" }, h("h3", {}, t("run.comparison", { axis })));
+  card.append(place);
   let data;
-  try { data = await api.comparison(run.id, axis); } catch (problem) { panel.append(h("p", { class: "error" }, problem.message)); return; }
+  try { data = await api.comparison(run.id, axis); } catch (problem) { place.append(h("p", { class: "error" }, problem.message)); return; }
   const charts = h("div", { class: "charts" });
-  panel.append(
+  place.append(
     table([t("run.parameters"), { n: t("run.rate_rms") }, { n: t("run.angle_rms") }], ["datasheet", "estimated"].map((key) => [
-      t(`run.with_${key}`), { n: fixed(data[key].rate_rms_dps, 3) }, { n: fixed(data[key].angle_rms_deg, 3) }]), { compact: true, label: t("run.comparison", { axis }) }),
+      t(`run.with_${key}`), { n: fixed(data[key].rate_rms_dps, 3) }, { n: fixed(data[key].angle_rms_deg, 3) }]), { compact: true, cards: true, label: t("run.comparison", { axis }) }),
     charts);
   for (const [quantity, unit, key] of [["rate", "deg/s", "rate_dps"], ["angle", "deg", "angle_deg"]]) {
     chart(charts, {
-      name: t(`run.compare_${quantity}`), group: `compare-${axis}`, height: 280,
+      name: t(`run.compare_${quantity}`), group: `compare-${axis}`, height: 220, wide: true,
       x: { label: t("chart.time"), unit: "s" }, y: { label: t(`chart.${quantity}`), unit, zero: true },
       series: [
         { name: t("chart.encoder"), role: "measured", draw: "line" },
@@ -110,11 +110,11 @@ async function comparison(section, run, axis) {
   }
 }
 
-function test(section, kind, result) {
+function test(card, kind, result) {
   if (!result.points) return;
   const charts = h("div", { class: "charts" });
-  section.append(h("div", { class: "panel stack" }, charts,
+  card.append(charts,
     h("details", {}, h("summary", {}, t("table.linearity")), linearityTable(result.points.linearity, kind)),
-    h("details", {}, h("summary", {}, t("table.repeat")), repeatTable(result.points.repeat, kind))));
+    h("details", {}, h("summary", {}, t("table.repeat")), repeatTable(result.points.repeat, kind)));
   testCharts(charts, kind).show(result.points, "linearity");
 }
