@@ -27,7 +27,7 @@ def render_pdf(content: Mapping[str, Any], lang: str) -> bytes:
     import fontpkg
     import typst
 
-    issued = datetime.datetime.fromisoformat(content["issued_at"])
+    issued = datetime.datetime.fromisoformat(content["issued_at"]).replace(microsecond=0)
     return typst.compile(
         str(TEMPLATE),
         font_paths=[str(fontpkg.path("Sarabun").parent)],
@@ -136,7 +136,9 @@ def _estimate(content: Mapping[str, Any], lang: str) -> Iterator[dict[str, Any]]
         yield _row(field, axes, lang, strong=True)
         expanded = [_expanded(field, axis) for axis in axes.values()]
         yield {"label": render("certificate.expanded", {}, lang), "unit": field.unit, "values": expanded, "minor": True}
-        yield _row(BY_PATH[("adaptive", name)], axes, lang, minor=True)
+        yield _row(BY_PATH[("adaptive", name)], axes, lang, minor=True) | {
+            "label": render("certificate.adaptive", {}, lang)
+        }
         sheet = [_datasheet(field, content["gyro_model"]["axes"].get(axis), axes[axis]) for axis in axes]
         yield {"label": render("certificate.datasheet", {}, lang), "unit": field.unit, "values": sheet, "minor": True}
     for path in (("delay_s",), ("step_check", "rate_error_pct"), ("step_check", "position_error_pct")):
