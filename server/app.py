@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from fastapi import Depends, FastAPI, Request
+from fastapi import FastAPI, Request
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import FileResponse, HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
@@ -15,6 +15,7 @@ from starlette.types import Scope
 from calib_core.problem import Problem
 from server import __version__, problems
 from server.api import ROUTERS, common
+from server.auth import Guard
 from server.settings import Settings
 from server.texts import WEB
 
@@ -58,9 +59,6 @@ def create_app(settings: Settings) -> FastAPI:
         finally:
             services.close()
 
-    async def guard(request: Request) -> None:
-        services.check_write(request)
-
     app = FastAPI(
         title="Gyrobench",
         version=__version__,
@@ -71,8 +69,9 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.services = services
     problems.install(app)
+    app.add_middleware(Guard, token=settings.token)
     for router in ROUTERS:
-        app.include_router(router, prefix="/api/v1", dependencies=[Depends(guard)])
+        app.include_router(router, prefix="/api/v1")
     files = vendored()
 
     def vendor(request: Request) -> FileResponse:

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from server import texts
+
 Arrays = Mapping[str, npt.NDArray[np.float64]]
 
 WINDOW_S = 120.0  # of bench time that a page can plot of the fast columns; the traces are kept whole
@@ -48,12 +50,12 @@ class LiveRun:
         self.run = run
         self.seq = 0
         self._lock = threading.Lock()
-        self._head: dict[str, Any] = {"run": run, "message": None, "certificate": None, **head}
+        self._head: dict[str, Any] = {"run": run, **head}
         self._chunks: dict[str, deque[tuple[int, Arrays]]] = {}
         self._dropped = 0  # the newest frame whose rows have left the window
         self._points: list[tuple[int, Any]] = []
         self._results: dict[str, tuple[int, Any]] = {}
-        self._encoded: dict[int | None, bytes] = {}
+        self._encoded: dict[tuple[int | None, str], bytes] = {}
         self._wakers: dict[object, Callable[[], None]] = {}
 
     @property
@@ -61,10 +63,15 @@ class LiveRun:
         return self._head["status"] in ENDED
 
     def feed(self, message: Mapping[str, Any], arrays: Arrays | None = None) -> None:
-        """Adds a frame: its "points" and "results" to those before, its arrays to the rings; all else replaces."""
+        """Adds a frame: its "points" and "results" to those before, its arrays to the rings; all else replaces.
+
+        A frame that says "reset" is everything so far, and comes where its sender had to start again.
+        """
         with self._lock:
             self.seq += 1
-            rest = dict(message)
+            rest = {name: value for name, value in message.items() if name not in ("seq", "run")}
+            if rest.pop("reset", False):
+                self._chunks, self._points, self._results, self._dropped = {}, [], {}, self.seq
             self._points += [(self.seq, point) for point in rest.pop("points", ())]
             self._results |= {state: (self.seq, result) for state, result in rest.pop("results", {}).items()}
             self._head.update(rest)
@@ -88,29 +95,39 @@ class LiveRun:
             while clock.endswith(".time_s") and chunks and not chunks[0][1][clock][-1] > latest - WINDOW_S:
                 self._dropped = max(self._dropped, chunks.popleft()[0])
 
-    def since(self, cursor: int | None) -> tuple[bytes, int] | None:
-        """What is newer than the cursor, and the next cursor; None where nothing is. Without a cursor: all of it."""
+    def since(self, cursor: int | None, lang: str = "en") -> tuple[bytes, int] | None:
+        """What is newer than the cursor, and the next cursor; None where nothing is. Without a cursor: all of it.
+
+        Encoded once for all viewers who stand at the same place and read the same language.
+        """
         with self._lock:
             if cursor == self.seq:
                 return None
             if cursor is not None and cursor < self._dropped:
                 cursor = None  # too far behind to be continued: start again
-            if cursor not in self._encoded:
-                after = -1 if cursor is None else cursor
-                arrays: dict[str, Any] = {}
-                for chunks in self._chunks.values():
-                    new = [chunk for seq, chunk in chunks if seq > after]
-                    for name in new[0] if new else ():
-                        arrays[name] = np.concatenate([chunk[name] for chunk in new])
-                message = {
-                    **self._head,
-                    "seq": self.seq,
-                    "reset": cursor is None,
-                    "points": [point for seq, point in self._points if seq > after],
-                    "results": {state: result for state, (seq, result) in self._results.items() if seq > after},
-                }
-                self._encoded[cursor] = encode(message, arrays)
-            return self._encoded[cursor], self.seq
+            if (cursor, lang) not in self._encoded:
+                self._encoded[cursor, lang] = self._encode(cursor, lang)
+            return self._encoded[cursor, lang], self.seq
+
+    def _encode(self, cursor: int | None, lang: str) -> bytes:
+        after = -1 if cursor is None else cursor
+        arrays: dict[str, Any] = {}
+        for chunks in self._chunks.values():
+            new = [chunk for seq, chunk in chunks if seq > after]
+            for name in new[0] if new else ():
+                arrays[name] = np.concatenate([chunk[name] for chunk in new])
+        message = self._head.get("message")
+        if message is not None:
+            message = {**message, "sentence": texts.render(message["code"], message["values"], lang)}
+        head = {
+            **self._head,
+            "message": message,
+            "seq": self.seq,
+            "reset": cursor is None,
+            "points": [point for seq, point in self._points if seq > after],
+            "results": {state: result for state, (seq, result) in self._results.items() if seq > after},
+        }
+        return encode(head, arrays)
 
     def watch(self, wake: Callable[[], None]) -> Callable[[], None]:
         """Calls ``wake`` after each frame, from the feeding thread, until the returned function is called."""

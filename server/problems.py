@@ -1,7 +1,6 @@
 """Every refusal as an RFC 9457 problem document, in the language that was asked for."""
 
 import json
-import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -14,7 +13,6 @@ from starlette.exceptions import HTTPException
 from calib_core.problem import Problem
 from server import texts
 
-log = logging.getLogger("gyrobench")
 MEDIA_TYPE = "application/problem+json"
 
 # Refusals that are not 422, "understood, and cannot be done".
@@ -121,7 +119,6 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def fault(request: Request, error: Exception) -> JSONResponse:
-        log.error("%s %s", request.method, request.url.path, exc_info=error)
         return answer(request, Problem("server.fault", kind=type(error).__name__))
 
 

@@ -143,7 +143,7 @@ def dumps(value: object) -> str:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
-_ID = re.compile(r"[A-Za-z0-9ก-๙][A-Za-z0-9ก-๙._-]{0,63}")
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def checked_id(value: str, what: str) -> str:

@@ -1,5 +1,15 @@
 """HTTP under /api/v1: one router a noun."""
 
-from server.api import health
+from server.api import boards, certificates, gyro_models, health, live, recordings, rig, runs, thesis
 
-ROUTERS = (health.router,)
+ROUTERS = (
+    health.router,
+    rig.router,
+    boards.router,
+    gyro_models.router,
+    runs.router,
+    live.router,
+    recordings.router,
+    certificates.router,
+    thesis.router,
+)

@@ -1,28 +1,38 @@
-"""What every route needs: the services of this server and the language asked for."""
+"""What every route needs: the services of this server, the language asked for, the parameters of a list."""
 
 import time
 from typing import Annotated
 
-from fastapi import Depends
+from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
-from server import auth, texts
+from server import texts
+from server.compute import Compute
+from server.lease import Lease
 from server.settings import Settings
+from server.store import Store
+from server.supervisor import Supervisor
 
 
 class Services:
-    """One server's parts; nothing runs before `start`."""
+    """One server's parts; opens the store, and starts nothing before `start`."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.started = time.monotonic()
+        self.store = Store(settings.data)
+        self.lease = Lease()
+        self.compute = Compute()
+        self.supervisor = Supervisor(settings, self.store)
 
-    def start(self) -> None: ...
+    def start(self) -> None:
+        self.store.runs.interrupt_open()
+        self.supervisor.start()
 
-    def close(self) -> None: ...
-
-    def check_write(self, connection: HTTPConnection) -> None:
-        auth.check_write(connection, self.settings.token)
+    def close(self) -> None:
+        self.supervisor.close()
+        self.compute.close()
+        self.store.close()
 
 
 def _services(connection: HTTPConnection) -> Services:
@@ -36,3 +46,6 @@ def _language(connection: HTTPConnection) -> str:
 
 Here = Annotated[Services, Depends(_services)]
 Language = Annotated[str, Depends(_language)]
+Limit = Annotated[int, Query(ge=1, le=200, description="at most so many")]
+Cursor = Annotated[str | None, Query(max_length=20, description="`next` of the page before")]
+Search = Annotated[str, Query(max_length=100, description="what to look for")]

@@ -21,4 +21,4 @@ class Health(BaseModel):
 
 @router.get("/health")
 async def health(here: Here) -> Health:
-    return Health(worker="starting", uptime_s=round(time.monotonic() - here.started, 3))
+    return Health(worker=here.supervisor.status, uptime_s=round(time.monotonic() - here.started, 3))

@@ -1,0 +1,288 @@
+"""Bodies as they are asked for and given, with their bounds; FastAPI makes OpenAPI of them."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from calib_core.problem import Problem
+from server.store_db import checked_id
+
+Axis = Literal["x", "z"]
+StateName = Literal["estimate_x", "rate_x", "position_x", "estimate_z", "rate_z", "position_z"]
+Profile = Literal["standard", "thesis"]
+RunStatus = Literal["queued", "running", "finished", "stopped", "failed", "interrupted"]
+Verdict = Literal["pass", "fail", "issued"]
+
+
+def _one_line(text: str) -> str:
+    if any(ord(letter) < 32 or ord(letter) == 127 for letter in text):
+        raise Problem("request.control_characters")
+    return text
+
+
+def _board(text: str) -> str:
+    return checked_id(text, "board")
+
+
+def _model(text: str) -> str:
+    return checked_id(text, "gyro_model")
+
+
+Line = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
+Note = Annotated[str, Field(max_length=2000)]
+BoardId = Annotated[str, AfterValidator(_board)]
+ModelId = Annotated[str, AfterValidator(_model)]
+Speed = Annotated[float, Field(ge=1, le=1000)] | Literal["max"]
+
+
+class Body(BaseModel):
+    """What a client sends: nothing unknown, no infinities, no text where a number is asked."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class Answer(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+
+# --- boards and gyro models ------------------------------------------------------------------------------------
+class BoardBody(Body):
+    id: BoardId
+    gyro_model: ModelId = "LPY503AL-OUT"
+    note: Note = ""
+
+
+class BoardChange(Body):
+    gyro_model: ModelId | None = None
+    note: Note | None = None
+
+
+class Board(Answer):
+    id: str
+    gyro_model: str
+    note: str
+    created_at: str
+    runs: int | list[dict[str, Any]] | None = None
+    certificates: int | list[dict[str, Any]] | None = None
+
+
+class Boards(BaseModel):
+    items: list[Board]
+    next: str | None
+
+
+Positive = Annotated[float, Field(gt=0, le=1e4)]
+
+
+class DatasheetBody(Body):
+    bias_V: float = Field(ge=-100, le=100)
+    scale_factor_V_per_dps: float = Field(ge=-10, le=10)
+    range_dps: Positive
+
+
+class RangesBody(Body):
+    rate_dps: Positive | None = None
+    position_deg: Annotated[float, Field(gt=0, le=150)] | None = None
+    sine_deg: Annotated[float, Field(gt=0, le=150)] | None = None
+
+
+RangesByAxis = dict[Axis, RangesBody]
+
+
+class GyroModelFacts(Body):
+    name: Line = ""
+    axes: dict[Axis, DatasheetBody] = Field(min_length=1)
+    output_min_V: float = Field(0.0, ge=-100, le=100)
+    output_max_V: float = Field(3.0, ge=-100, le=100)
+    ranges: RangesByAxis = {}
+
+
+class GyroModelBody(GyroModelFacts):
+    id: ModelId
+
+
+class GyroModelAnswer(Answer):
+    id: str
+    name: str
+    preset: bool
+    axes: dict[str, dict[str, float]]
+    ranges: dict[str, dict[str, float]]
+    output_min_V: float
+    output_max_V: float
+
+
+class GyroModels(BaseModel):
+    items: list[GyroModelAnswer]
+    next: None = None
+
+
+# --- runs ------------------------------------------------------------------------------------------------------
+class Conditions(Body):
+    room_temperature_degC: float | None = Field(None, ge=-60, le=150)
+
+
+class RunBody(Body):
+    board: BoardId
+    gyro_model: ModelId | None = Field(None, description="the board's own where it is left out")
+    profile: Profile = "standard"
+    states: list[StateName] | None = Field(None, min_length=1, max_length=6, description="only these")
+    readings: int | None = Field(None, ge=3, le=1000, description="replaces the 22 of each repeat test")
+    operator: Line = ""
+    note: Note = ""
+    seed: int | None = Field(None, ge=0, lt=2**53)
+    ranges: RangesByAxis | None = None
+    conditions: Conditions = Conditions()
+    spec: dict[str, Any] | None = None
+    continues: str | None = Field(None, max_length=64, description="a run whose other states are taken over")
+    speed: Speed | None = None
+
+
+class StatePlan(BaseModel):
+    name: StateName
+    seconds: float
+    readings: int
+
+
+class PlanAnswer(BaseModel):
+    states: list[StatePlan]
+    seconds: float
+
+
+class Message(BaseModel):
+    code: str
+    values: dict[str, Any]
+    sentence: str
+
+
+class RunState(BaseModel):
+    name: StateName
+    status: Literal["waiting", "running", "done", "failed", "kept"]
+    result: dict[str, Any] | None
+
+
+class Run(Answer):
+    id: str
+    status: RunStatus
+    recording: str
+    board: str
+    gyro_model: str
+    profile: Profile
+    states: list[RunState]
+    operator: str
+    note: str
+    seed: int
+    readings: int
+    conditions: dict[str, Any]
+    rig: str
+    created_at: str
+    started_at: str | None
+    finished_at: str | None
+    message: Message | None
+    certificate: str | None
+    duration_s: float | None
+    plan: dict[str, Any]
+    results: dict[str, Any]
+
+
+class Runs(BaseModel):
+    items: list[Run]
+    next: str | None
+
+
+class Series(BaseModel):
+    columns: dict[str, list[float | None]]
+
+
+# --- recordings and certificates -------------------------------------------------------------------------------
+class RecordingAnswer(Answer):
+    id: str
+    name: str
+    board: str
+    run: str | None
+    source: str
+    header: dict[str, str]
+    digest: str | None
+    samples: int
+    duration_s: float
+    created_at: str
+
+
+class Recordings(BaseModel):
+    items: list[RecordingAnswer]
+    next: str | None
+
+
+class CertificateBody(Body):
+    recording: str = Field(max_length=64)
+    model: ModelId | None = None
+    spec: dict[str, Any] | None = None
+
+
+class CertificateRow(Answer):
+    number: str
+    board: str
+    recording: str
+    verdict: Verdict
+    issued_at: str
+    operator: str
+
+
+class Certificates(BaseModel):
+    items: list[CertificateRow]
+    next: str | None
+
+
+class Certificate(Answer):
+    number: str
+    issued_at: str
+    board: str
+    verdict: Verdict
+    axes: dict[str, Any]
+    recording: dict[str, Any]
+    warnings: list[dict[str, Any]]
+
+
+class Verified(Answer):
+    valid: bool
+
+
+# --- rig -------------------------------------------------------------------------------------------------------
+class RigBody(Body):
+    url: Annotated[str, Field(min_length=1, max_length=400), AfterValidator(_one_line)]
+    speed: Speed | None = None
+
+
+class LeaseBody(Body):
+    holder: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_one_line)]
+
+
+class Lease(BaseModel):
+    token: str
+    expires_at: str
+
+
+class Held(BaseModel):
+    holder: str
+    expires_at: str
+
+
+class Part(BaseModel):
+    part: str
+    ok: bool | None
+    code: str
+    values: dict[str, Any]
+    sentence: str
+
+
+class Rig(Answer):
+    url: str
+    kind: str
+    simulated: bool
+    speed: float | Literal["max"]
+    connected: bool
+    parts: list[Part]
+    lease: Held | None
+    run: str | None
+    axes: dict[str, dict[str, Any]]
+    ports: list[str]
+    choices: list[dict[str, str]]

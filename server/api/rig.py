@@ -1,0 +1,85 @@
+"""The rig: what it is, what answers, who holds it, and the emergency stop."""
+
+import math
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Response
+from starlette.concurrency import run_in_threadpool
+
+from server import texts
+from server.api import models
+from server.api.common import Here, Language, Services
+from server.problems import declared
+from server.settings import checked_speed, is_simulated
+
+router = APIRouter(prefix="/rig", tags=["rig"])
+LeaseToken = Annotated[str | None, Header(alias="X-Rig-Lease", max_length=200)]
+
+
+def shown(here: Services, lang: str) -> dict[str, Any]:
+    bench = here.supervisor
+    status = bench.rig or {}
+    parts = [{**part, "sentence": texts.render(part["code"], part["values"], lang)} for part in status.get("parts", ())]
+    found = ports()
+    choices = [{"url": "twin:", "label": texts.render("rig.choice.twin", {}, lang)}]
+    for port in found:
+        url = f"dynamixel:{port}?ids=1,2&baud=1000000+nidaq:Dev1?channels=ai0,ai1"
+        choices.append({"url": url, "label": texts.render("rig.choice.port", {"port": port}, lang)})
+    return {
+        "url": bench.url,
+        "kind": bench.url.split(":", 1)[0],
+        "simulated": is_simulated(bench.url),
+        "speed": "max" if math.isinf(bench.speed) else bench.speed,
+        "connected": bool(status.get("connected")),
+        "parts": parts,
+        "lease": here.lease.shown(),
+        "run": bench.run,
+        "axes": status.get("axes", {}),
+        "ports": found,
+        "choices": choices,
+        "worker": bench.status,
+    }
+
+
+def ports() -> list[str]:
+    """The serial ports of this computer."""
+    from serial.tools import list_ports
+
+    return sorted(port.device for port in list_ports.comports())
+
+
+@router.get("", summary="What the rig is and what answers")
+def status(here: Here, lang: Language) -> models.Rig:
+    return models.Rig(**shown(here, lang))
+
+
+@router.put("", summary="Choose the rig", responses=declared(409, 502, 503))
+def choose(body: models.RigBody, here: Here, lang: Language, lease: LeaseToken = None) -> models.Rig:
+    here.lease.check(lease)
+    speed = checked_speed(body.speed, body.url)
+    here.supervisor.open_rig(body.url, speed)
+    return models.Rig(**shown(here, lang))
+
+
+@router.post("/check", summary="Ask every part again", responses=declared(409, 502, 503))
+def check(here: Here, lang: Language, lease: LeaseToken = None) -> models.Rig:
+    here.lease.check(lease)
+    here.supervisor.check_rig()
+    return models.Rig(**shown(here, lang))
+
+
+@router.post("/lease", summary="Hold the rig, or go on holding it", responses=declared(409))
+def take_lease(body: models.LeaseBody, here: Here, lease: LeaseToken = None) -> models.Lease:
+    return models.Lease(**here.lease.take(body.holder, lease))
+
+
+@router.delete("/lease", status_code=204, summary="Give the rig back", responses=declared(409))
+def give_back(here: Here, lease: LeaseToken = None) -> Response:
+    here.lease.give_back(lease)
+    return Response(status_code=204)
+
+
+@router.post("/stop", status_code=204, summary="Emergency stop: no body, no token, never locked")
+async def stop(here: Here) -> Response:
+    await run_in_threadpool(here.supervisor.stop)
+    return Response(status_code=204)

@@ -1,0 +1,133 @@
+"""Work that takes more than a moment, in a process of its own: the server goes on answering and the live page moving.
+
+Every function here is named by the caller and run there; it opens the store by its directory.
+"""
+
+import asyncio
+import multiprocessing
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, TypeVar
+
+from calib_core.problem import Problem
+
+T = TypeVar("T")
+
+
+class Compute:
+    """One process, started with the first work and again if it was ended."""
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+        self._once: dict[str, Any] = {}
+
+    async def run(self, work: Callable[..., T], *arguments: object) -> T:
+        for attempt in (1, 2):
+            if self._pool is None:
+                context = multiprocessing.get_context("spawn")
+                self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin)
+            pool = self._pool
+            try:
+                return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
+            except BrokenProcessPool:
+                if self._pool is pool:
+                    self._pool = None
+                if attempt == 2:
+                    raise Problem("server.fault", kind="BrokenProcessPool") from None
+        raise AssertionError("unreachable")
+
+    async def once(self, name: str, work: Callable[[], T]) -> T:
+        """What does not change while the program runs, computed at the first request for it."""
+        if name not in self._once:
+            self._once[name] = await self.run(work)
+        result: T = self._once[name]
+        return result
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool = None
+
+
+def _begin() -> None:
+    # The small matrices of this work are slower with two threads than with one.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, str] | None, board: str | None) -> str:
+    """Reads and keeps an uploaded recording; gives its id. Raises Problem as `calib_core.recording.read`."""
+    from calib_core.recording import read
+    from server.store import Store
+
+    with file.open("rb") as opened:
+        recording = read(opened, name=name, mapping=mapping)
+    board = board or recording.header.get("board") or "unknown"
+    with Store(data) as store:
+        store.boards.ensure(board, gyro_model=recording.header.get("sensor") or "LPY503AL-OUT")
+        return store.recordings.add(recording, board=board, name=name)
+
+
+def export_recording(data: Path, recording: str, form: str, file: Path) -> None:
+    """Writes "csv", "parquet" or "fast.csv" of a stored recording to ``file``."""
+    from calib_core.recording import write_csv, write_parquet
+    from server.store import Store
+
+    with Store(data) as store, file.open("wb") as opened:
+        loaded = store.recordings.load(recording, kind="fast" if form == "fast.csv" else "rows")
+        (write_parquet if form == "parquet" else write_csv)(loaded, opened)
+
+
+def series(data: Path, recording: str, state: str | None, max_points: int) -> dict[str, list[float | None]]:
+    """Columns of a stored recording, every k-th row of them, None where there is no sample."""
+    from server.store import Store
+
+    with Store(data) as store:
+        loaded = store.recordings.load(recording, state=state)
+    every = slice(None, None, -(-len(loaded) // max_points))
+    columns = {"time_s": loaded.time_s, **loaded.columns}
+    return {name: [None if x != x else x for x in values[every].tolist()] for name, values in columns.items()}
+
+
+def comparison(data: Path, recording: str, axis: str, max_points: int) -> dict[str, Any]:
+    """Rate and angle against the encoder, with the datasheet's parameters and with the estimated ones."""
+    from calib_core import comparison
+    from server.store import Store
+
+    with Store(data) as store:
+        return dict(comparison.of_session(store.recording(recording), axis, max_points=max_points))
+
+
+def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, Any] | None) -> dict[str, Any]:
+    from server import certify as room
+    from server.store import Store
+
+    with Store(data) as store:
+        gyro_model = store.gyro_models.get(model) if model else None
+        return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec))
+
+
+def verify(data: Path, number: str) -> dict[str, Any]:
+    from server import certify as room
+    from server.store import Store
+
+    with Store(data) as store:
+        certificate = store.certificates.get(number)
+        return dict(room.verify(certificate, store.recording(certificate["recording"]["id"])))
+
+
+def document(data: Path, number: str, form: str, lang: str) -> bytes:
+    """A certificate as "pdf", "csv" or "json"."""
+    from server.documents import render
+    from server.store import Store
+
+    with Store(data) as store:
+        return bytes(render(store.certificates.get(number), form, lang=lang))
+
+
+def thesis() -> dict[str, Any]:
+    from calib_core.thesis import report
+
+    return dict(report())

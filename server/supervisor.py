@@ -1,0 +1,223 @@
+"""The server's side of the worker: starts it, hands it commands, notices its death and starts the next."""
+
+import itertools
+import logging
+import math
+import multiprocessing
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as TookTooLong
+from multiprocessing.connection import Connection
+from typing import Any, Literal
+
+from calib_core.problem import Problem
+from server import worker
+from server.live import LiveRun, decode
+from server.settings import Settings
+from server.store import Store
+
+log = logging.getLogger("gyrobench")
+KEPT_RUNS = 4  # live runs that a page may still want after their end
+STOP_S = 0.3
+HUNG_S = 2.0  # a worker that has not said "safe" by then is ended, and the next one makes the motors safe
+REPLY_S = 15.0
+RESTART_S = 1.0
+
+
+class Supervisor:
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self._settings = settings
+        self._store = store
+        self._send_lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._pipe: Connection | None = None
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._replies: dict[int, Future[Any]] = {}
+        self._numbers = itertools.count(1)
+        self._closing = threading.Event()
+        self._ready = threading.Event()
+        self._safe = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="supervisor", daemon=True)
+        self._started = False
+        self.url, self.speed = settings.rig, settings.speed
+        self.rig: dict[str, Any] | None = None  # what the worker last said of its rig
+        self.run: str | None = None
+        self.live: dict[str, LiveRun] = {}
+
+    @property
+    def status(self) -> Literal["ready", "starting", "dead"]:
+        if self._ready.is_set():
+            return "ready"
+        return "dead" if self._closing.is_set() else "starting"
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid if self._process else None
+
+    def start(self) -> None:
+        self._thread.start()
+        self._started = True
+
+    def close(self) -> None:
+        """Ends the worker; it makes the motors safe first."""
+        self._closing.set()
+        self._send("quit")
+        if self._started:
+            self._thread.join(5.0)
+
+    # --- commands ----------------------------------------------------------------------------------------------
+    def begin(self, run: str, speed: float, head: Mapping[str, Any]) -> None:
+        """Hands a stored, queued run to the worker. The caller holds `claim`."""
+        with self._lock:
+            self.live[run] = LiveRun(run, {"message": None, "certificate": None})
+            self.live[run].feed({**head, "speed": speed if math.isfinite(speed) else "max"})
+            for old in list(self.live)[:-KEPT_RUNS]:
+                del self.live[old]
+            self.run = run
+        if not self._send("run", run, speed):
+            self._interrupt(run)
+
+    def claim(self) -> threading.RLock:
+        """Held while a run is made, so that two requests cannot both find the rig free."""
+        return self._lock
+
+    def check_free(self) -> None:
+        """Raises Problem while a run is on, or where no worker is there to take one."""
+        if self.run is not None:
+            raise Problem("run.busy", run=self.run)
+        if not self._ready.wait(REPLY_S):
+            raise Problem("worker.not_ready")
+
+    def open_rig(self, url: str, speed: float) -> None:
+        """Changes the rig; raises Problem where it does not open, and the worker is then without one."""
+        self.check_free()
+        self.url, self.speed = url, speed
+        self._ask("open", url)
+
+    def check_rig(self) -> None:
+        self.check_free()
+        self._ask("check")
+
+    def stop(self) -> bool:
+        """Stops whatever moves, and waits for the motors to be safe; True where they are within 0.3 s."""
+        self._safe.clear()
+        if not self._send("stop"):
+            return False  # no worker, so nothing of ours moves; the next one makes the motors safe first
+        if self._safe.wait(STOP_S):
+            return True
+        threading.Thread(target=self._end_if_hung, args=[self._process], daemon=True).start()
+        return False
+
+    def stop_run(self, run: str) -> None:
+        """Stops this run and waits a moment for its end to be stored. Raises Problem where it is not on."""
+        if self.run != run:
+            raise Problem("run.not_running", run=run)
+        ended = threading.Event()
+        leave = self.live[run].watch(lambda: ended.set() if self.live[run].ended else None)
+        self.stop()
+        ended.wait(HUNG_S)
+        leave()
+
+    def _end_if_hung(self, process: "multiprocessing.process.BaseProcess | None") -> None:
+        if not self._safe.wait(HUNG_S) and process is not None:
+            log.error("the worker does not answer the stop; ending it")
+            process.kill()
+
+    def _ask(self, command: str, *arguments: object) -> Any:
+        number, reply = next(self._numbers), Future[Any]()
+        self._replies[number] = reply
+        try:
+            if not self._send(command, number, *arguments):
+                raise Problem("worker.not_ready")
+            return reply.result(REPLY_S)
+        except TookTooLong:
+            raise Problem("worker.no_answer", seconds=REPLY_S) from None
+        finally:
+            self._replies.pop(number, None)
+
+    def _send(self, command: str, *arguments: object) -> bool:
+        with self._send_lock:
+            if self._pipe is None:
+                return False
+            try:
+                self._pipe.send((command, *arguments))
+            except OSError:
+                return False
+            return True
+
+    # --- the worker's life -------------------------------------------------------------------------------------
+    def _loop(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        while not self._closing.is_set():
+            born = time.monotonic()
+            ours, theirs = context.Pipe()
+            arguments = (theirs, str(self._store.data), self.url)
+            process = context.Process(target=worker.main, args=arguments, name="gyrobench-worker", daemon=True)
+            process.start()
+            theirs.close()
+            with self._send_lock:
+                self._pipe, self._process = ours, process
+            try:
+                while True:
+                    self._received(*ours.recv())
+            except (EOFError, OSError):
+                pass
+            self._gone(process)
+            if not self._closing.is_set() and time.monotonic() - born < RESTART_S:
+                self._closing.wait(RESTART_S)  # a worker that dies at once is not started in a tight circle
+
+    def _gone(self, process: "multiprocessing.process.BaseProcess") -> None:
+        self._ready.clear()
+        with self._send_lock:
+            pipe, self._pipe = self._pipe, None
+        if pipe is not None:
+            pipe.close()
+        process.join(2.0)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        self.rig = None
+        for reply in list(self._replies.values()):
+            if not reply.done():
+                reply.set_exception(Problem("worker.not_ready"))
+        if self.run is not None:
+            self._interrupt(self.run)
+
+    def _interrupt(self, run: str) -> None:
+        message = {"code": "run.interrupted", "values": {}}
+        try:
+            self._store.runs.finish(run, "interrupted", message=message)
+        except Problem:
+            log.exception("run %s cannot be marked as interrupted; the next start does it", run)
+        self._ended(run, {"status": "interrupted", "message": message})
+
+    def _ended(self, run: str, last: Mapping[str, Any]) -> None:
+        with self._lock:
+            if self.run == run:
+                self.run = None
+        if run in self.live:
+            self.live[run].feed(last)
+
+    def _received(self, kind: str, *content: Any) -> None:
+        match kind, content:
+            case "frame", (str(run), bytes(data)):
+                if run in self.live:
+                    self.live[run].feed(*decode(data))
+            case "rig", (dict(status),):
+                self.rig = status
+                self._ready.set()
+            case "reply", (int(number), result):
+                reply = self._replies.get(number)
+                if reply is not None and not reply.done():
+                    if isinstance(result, Problem):
+                        reply.set_exception(result)
+                    else:
+                        reply.set_result(result)
+            case "safe", ():
+                self._safe.set()
+            case "ended", (str(run), dict(last)):
+                self._ended(run, last)
+            case _:
+                log.error("the worker said %s, which nobody understands", kind)

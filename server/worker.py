@@ -1,0 +1,164 @@
+"""The one process that owns the rig: what is measured goes to the store first, then to whoever watches.
+
+Commands come in through a pipe, read by a thread that does nothing else, so that a stop reaches the motors while the
+main thread is busy. The process ends when the pipe does, and leaves the motors safe.
+"""
+
+import logging
+import os
+import queue
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any
+
+from calib_core.problem import Problem
+
+if TYPE_CHECKING:
+    from server.devices.rig import Rig
+    from server.live import LiveRun
+
+log = logging.getLogger("gyrobench.worker")
+FRAME_S = 0.05  # twenty frames a second
+
+
+def main(pipe: Connection, data: str, url: str) -> None:
+    """The process. Heavy imports are inside, because the server imports this module too."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the small matrices here are slower with two threads
+    with suppress(KeyboardInterrupt):
+        Worker(pipe, data, url).serve()
+
+
+class Worker:
+    def __init__(self, pipe: Connection, data: str, url: str) -> None:
+        from server.store import Store
+
+        self._pipe = pipe
+        self._store = Store(data)
+        self._url = url
+        self._rig: Rig | None = None
+        self._commands: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
+        self._abort = threading.Event()
+        self._telling = threading.Lock()
+
+    def serve(self) -> None:
+        """Makes the motors safe, says what answers, then does what it is told until it is told to quit."""
+        threading.Thread(target=self._listen, name="listener", daemon=True).start()
+        with suppress(Problem):
+            self._open()
+        self._tell("rig", self._status())
+        try:
+            while True:
+                match self._commands.get():
+                    case ("quit",):
+                        return
+                    case ("run", str(run), float(speed)):
+                        self._run(run, speed)
+                    case ("open", int(number), str(url)):
+                        self._url = url
+                        self._answer(number, self._open)
+                    case ("check", int(number)):
+                        self._answer(number, self._open)
+        finally:
+            self._close()
+            self._store.close()
+
+    # --- the listening thread ----------------------------------------------------------------------------------
+    def _listen(self) -> None:
+        while True:
+            try:
+                command = self._pipe.recv()
+            except (EOFError, OSError):
+                command = ("quit",)
+            match command[0]:
+                case "stop" | "quit":
+                    self._stop()
+                case "run":
+                    self._abort.clear()  # here, in the order of the pipe: a stop sent after this run must find it
+            if command[0] != "stop":
+                self._commands.put(command)
+            if command[0] == "quit":
+                return
+
+    def _stop(self) -> None:
+        self._abort.set()
+        rig = self._rig
+        if rig is not None:
+            try:
+                rig.safe()
+            except Exception:
+                log.exception("the rig could not be made safe")
+                return
+        self._tell("safe")
+
+    # --- the working thread ------------------------------------------------------------------------------------
+    def _open(self) -> None:
+        """Connects the rig at the address in use, motors safe first. Raises Problem where a part does not answer."""
+        from server.devices import open_rig
+
+        self._close()
+        self._rig = open_rig(self._url)
+        self._rig.open()
+        self._rig.safe()
+
+    def _opened(self) -> "Rig":
+        if self._rig is None:
+            self._open()
+        assert self._rig is not None
+        return self._rig
+
+    def _close(self) -> None:
+        rig, self._rig = self._rig, None
+        if rig is not None:
+            with suppress(Problem):
+                rig.close()
+
+    def _status(self) -> dict[str, Any]:
+        rig = self._rig
+        if rig is None:
+            return {"connected": False, "parts": [], "axes": {}}
+        axes = {name: {**vars(axis)} for name, axis in rig.axes.items()}
+        return {"connected": rig.connected, "parts": rig.status(), "axes": axes}
+
+    def _run(self, run: str, speed: float) -> None:
+        from server.conduct import conduct
+        from server.live import LiveRun
+
+        live = LiveRun(run, {"status": "running"})
+        done = threading.Event()
+        sender = threading.Thread(target=self._send_frames, args=(live, done), name="frames")
+        sender.start()
+        try:
+            last = conduct(self._store, run, self._opened, speed=speed, abort=self._abort, live=live)
+        finally:
+            done.set()
+            sender.join()
+        self._tell("rig", self._status())
+        self._tell("ended", run, last)
+
+    def _send_frames(self, live: "LiveRun", done: threading.Event) -> None:
+        """Sends what is new, at most twenty times a second; a server that is slow to read does not delay the run."""
+        cursor: int | None = None
+        while True:
+            last = done.is_set()
+            new = live.since(cursor)
+            if new is not None:
+                message, cursor = new
+                self._tell("frame", live.run, message)
+            if last:
+                return
+            done.wait(FRAME_S)
+
+    def _answer(self, number: int, work: Callable[[], None]) -> None:
+        try:
+            work()
+            answer: object = None
+        except Problem as problem:
+            answer = problem
+        self._tell("rig", self._status())
+        self._tell("reply", number, answer)
+
+    def _tell(self, kind: str, *content: object) -> None:
+        with self._telling, suppress(OSError):  # without a server there is nobody to tell; the run goes on
+            self._pipe.send((kind, *content))
