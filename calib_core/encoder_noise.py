@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 REST_S = 0.4
 """The same code for at least this long is a rest."""
@@ -21,23 +22,30 @@ PATTERN = 16
 """Two readings see the same motion where this many codes before and after them are equal."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Readings:
-    """What is known about m readings: the encoder's step (0 if it has none) and, for each, run and recurrence."""
+    """m readings in time order and what their codes tell about their errors."""
 
+    time_s: F64
+    angle_deg: F64
     step_deg: float
+    """The spacing of the codes; 0 where the angles lie on no grid."""
     run: Ints
-    """(m,) how many consecutive readings share this one's code."""
+    """How many consecutive readings share this one's code."""
     recurrence: Ints
-    """(m,) how many different runs show this one's code pattern."""
+    """How many different runs show this one's code pattern."""
     rest: Ints
-    """(m,) the number of the rest it belongs to, -1 while moving."""
+    """The number of the rest it belongs to, -1 while moving."""
+
+    def take(self, chosen: Mask) -> "Readings":
+        """The readings ``chosen`` (m,)."""
+        arrays = (a[chosen] for a in (self.run, self.recurrence, self.rest))
+        return Readings(self.time_s[chosen], self.angle_deg[chosen], self.step_deg, *arrays)
 
     @property
     def variance(self) -> F64:
-        """(m,) deg², of the error of each reading as such; a rest's readings share one error."""
-        spread = np.where(self.rest >= 0, 1.0, np.maximum(1.0, self.run / 2.0))
-        return self.step_deg**2 / 12.0 * spread
+        """(m,) deg², of the error of each reading; a rest's readings share one error."""
+        return self.step_deg**2 / 12.0 * np.where(self.rest >= 0, 1.0, np.maximum(1.0, self.run / 2.0))
 
 
 def step_of(angle_deg: F64) -> float:
@@ -56,30 +64,29 @@ def step_of(angle_deg: F64) -> float:
 
 
 def inspect(time_s: F64, angle_deg: F64) -> Readings:
-    """Steps, runs, rests and recurrence of the readings (m,) at increasing times (m,)."""
+    """Step, runs, rests and recurrence of the readings (m,) at increasing times (m,)."""
     m = len(angle_deg)
     step = step_of(angle_deg)
-    if step == 0.0:
-        same = np.zeros(m, np.int64)
-        still = len(np.unique(angle_deg)) == 1
-        return Readings(0.0, np.full(m, m if still else 1), np.ones(m, np.int64), same if still else same - 1)
-    codes = np.round(angle_deg / step).astype(np.int64)
+    codes = np.round((angle_deg - angle_deg[0]) / (step or 1.0)).astype(np.int64)
+    if step == 0.0 and np.ptp(angle_deg) > 0.0:
+        one = np.ones(m, np.int64)
+        return Readings(time_s, angle_deg, 0.0, one, one, -one)
     first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1) != 0)
     last = np.append(first[1:], m) - 1
     length = last - first + 1
     number = np.repeat(np.arange(len(first)), length)
 
-    resting = time_s[last] - time_s[first] >= REST_S
-    resting &= ~_passing(codes[first], length)
+    resting = (time_s[last] - time_s[first] >= REST_S) & ~_passing(codes[first], length)
     rest = np.where(resting[number], np.cumsum(resting)[number] - 1, -1)
-    trimmed = (time_s - time_s[first][number] < SETTLING_S) & (number > 0)
-    trimmed |= (time_s[last][number] - time_s < SETTLING_S) & (number < len(first) - 1)
-    rest[trimmed] = -1
-    run = np.where(resting[number] & (rest < 0), np.searchsorted(time_s, time_s[0] + SETTLING_S), length[number])
-    return Readings(step, run, _recurrence(codes, number), rest)
+    settling = (time_s - time_s[first][number] < SETTLING_S) & (number > 0)
+    settling |= (time_s[last][number] - time_s < SETTLING_S) & (number < len(first) - 1)
+    rest[settling] = -1
+    settled = int(np.searchsorted(time_s, time_s[0] + SETTLING_S))
+    run = np.where(resting[number] & (rest < 0), settled, length[number])
+    return Readings(time_s, angle_deg, step, run, _recurrence(codes, number), rest)
 
 
-def _passing(code: Ints, length: Ints) -> NDArray[np.bool_]:
+def _passing(code: Ints, length: Ints) -> Mask:
     """Which runs are slow motion in one direction, not a rest: neighbours one code away, and long themselves."""
     passing = np.zeros(len(code), bool)
     step = np.diff(code)
@@ -94,9 +101,13 @@ def _recurrence(codes: Ints, number: Ints) -> Ints:
     if m <= 2 * PATTERN:
         return np.ones(m, np.int64)
     weights = np.random.default_rng(0).integers(1, 2**62, 2 * PATTERN + 1)
-    with np.errstate(over="ignore"):
-        pattern = np.convolve(codes, weights, mode="valid")  # wraps: a hash of the codes around each reading
+    pattern = np.convolve(codes, weights, mode="valid")  # wraps: a hash of the codes around each reading
     pattern = np.concatenate([np.full(PATTERN, pattern[0]), pattern, np.full(PATTERN, pattern[-1])])
-    pairs = np.unique(np.stack([pattern, number]), axis=1)
-    seen, runs = np.unique(pairs[0], return_counts=True)
-    return runs[np.searchsorted(seen, pattern)]
+    order = np.lexsort((number, pattern))
+    pattern, number = pattern[order], number[order]
+    new_pattern = np.diff(pattern, prepend=pattern[0] - 1) != 0
+    new_run = new_pattern | (np.diff(number, prepend=-1) != 0)
+    group = np.cumsum(new_pattern) - 1
+    seen = np.empty(m, np.int64)
+    seen[order] = np.bincount(group, weights=new_run).astype(np.int64)[group]
+    return seen

@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_core.noise_fit import NoiseFit, fit_noise
+from calib_core.code_likelihood import Sites, path_variance, sharpen
+from calib_core.encoder_noise import Readings
+from calib_core.noise_fit import NoiseFit, first_guess, fit_noise
 from calib_core.recording import Recording
 from calib_core.rows import Averages, samples, with_encoder, with_reference
 from calib_core.uncertainty import coverage_factor
@@ -22,6 +24,8 @@ F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SUFFIX = {"V": "V", "deg/s": "dps", "counts": "counts"}
+ROUNDS = 3
+"""Rounds over the codes; a fourth moves S by less than a hundredth of its uncertainty."""
 MOVED_STEPS = 20.0
 """An encoder that moved by fewer of its steps says nothing about the scale factor."""
 
@@ -90,9 +94,7 @@ class Design:
     """(n,) the reference's mean rate over each row."""
     reference: str
     """"stationary", "rate" or "encoder"."""
-    recurrence: F64
-    """(m,) by which the readings' variance grows where motion repeats the same codes."""
-    encoder_step_deg: float
+    readings: Readings | None = None
 
     @classmethod
     def of(cls, recording: Recording, axis: str, mask: Mask | None = None) -> "Design":
@@ -101,16 +103,16 @@ class Design:
         rate = recording.reference_rate(axis)
         if rate is not None:
             rows, averages, mean = with_reference(gyro, rate)
-            return cls(rows, averages, mean, "stationary" if recording.stationary else "rate", np.empty(0), 0.0)
-        rows, averages, mean, readings = with_encoder(gyro, *recording.position(axis))
-        return cls(rows, averages, mean, "encoder", readings.recurrence.astype(float), readings.step_deg)
+            return cls(rows, averages, mean, "stationary" if recording.stationary else "rate")
+        rows, averages, readings = with_encoder(gyro, *recording.position(axis))
+        rate = _slopes(rows, readings.angle_deg)
+        return cls(rows, averages, rate, "encoder", readings)
 
     @property
     def moves(self) -> bool:
         """Whether the reference moved enough to tell a scale factor."""
-        if self.reference == "encoder":
-            travel = np.cumsum(self.rate * self.rows.dt_s)
-            return bool(np.ptp(travel) > MOVED_STEPS * self.encoder_step_deg)
+        if self.readings is not None:
+            return bool(np.ptp(self.readings.angle_deg) > MOVED_STEPS * self.readings.step_deg)
         return self.reference == "rate" and bool(np.ptp(self.rate) > 0.0)
 
     def output(self, delay_s: float) -> F64:
@@ -123,7 +125,7 @@ class Design:
         one = np.ones(len(self.rows))
         if not self.moves:
             return one[:, None]
-        if self.reference == "rate":
+        if self.readings is None:
             s = self.averages.samples
             grid = s.time_s[self.averages.at]
             rate = np.interp(grid - delay_s, grid, self.rate)
@@ -132,26 +134,68 @@ class Design:
         return np.column_stack([one, self.rate, np.where(self.averages.at < 0, -change, 0.0)])
 
     def solve(self) -> "Solution":
-        """Noise and parameters by turns: rough, then with the noise estimated, then with the delay taken out."""
-        p = self.columns(0.0, 0.0).shape[1]
-        values = np.zeros(p)
-        if p > 1:
-            level = self.output(0.0) * self.rows.dt_s
-            path = np.column_stack(
-                [np.cumsum(self.rows.dt_s), np.cumsum(self.rate * self.rows.dt_s), np.ones(len(level))]
-            )
-            values[:2] = np.linalg.lstsq(path, np.cumsum(level), rcond=None)[0][:2]
-        delay, noise = 0.0, None
-        for _ in range(2):
-            y, columns = self.output(delay), self.columns(delay, values[1] if p > 1 else 0.0)
-            if noise is None:
-                noise = fit_noise(self.rows, y, columns, values[1] if p > 1 else 0.0)
-            values[2:] = 0.0
-            values, covariance = self.estimate(y, columns, noise.noise, values)
-            if p == 1:
+        """Noise and parameters by turns, the delay taken out as it is found and the codes read ever more sharply."""
+        design, y, values = self, self.output(0.0), self._rough()
+        scale_factor = float(values[1]) if len(values) > 1 else 0.0
+        start = RowNoise(first_guess(self.rows, y), reading_deg=self._reading_noise(y, values))
+        noise = fit_noise(self.rows, y, self.columns(0.0, scale_factor), scale_factor, start)
+        delay = 0.0
+        rounds = ROUNDS if self.readings is not None and self.readings.step_deg > 0.0 else 1
+        sites = None
+        for turn in range(rounds + 1):
+            columns = design.columns(delay, scale_factor)
+            if turn:
+                noise = fit_noise(design.rows, y, columns, scale_factor, noise.noise)
+            values, covariance = design.estimate(y, columns, noise.noise, values)
+            if len(values) == 1:
                 break
-            delay += float(values[2])
-        return Solution(y, columns, values, covariance, delay, noise)
+            delay, values[2], scale_factor = delay + float(values[2]), 0.0, float(values[1])
+            y = self.output(delay)
+            if turn < rounds and self.readings is not None and self.readings.step_deg > 0.0:
+                sites = design._sharpened(y, columns, values, noise.noise, sites)
+                design = self._at(sites)
+                noise = replace(noise, base=replace(noise.base, reading_deg=0.0))
+        return Solution(y, columns, values, covariance, delay, noise, sites)
+
+    def _rough(self) -> F64:
+        """Parameters (p,) from the integrals by plain least squares, to start from."""
+        y, dt = self.output(0.0), self.rows.dt_s
+        if not self.moves:
+            return np.array([y.mean()])
+        path = np.cumsum(np.column_stack([np.ones(len(y)), self.rate, y]) * dt[:, None], axis=0)
+        path[:, 2] -= path[:, 0] * y.mean()
+        known = np.column_stack([path[:, :2], np.ones(len(y))])
+        bias, scale_factor, _ = np.linalg.lstsq(known, path[:, 2], rcond=None)[0]
+        return np.array([bias + y.mean(), scale_factor, 0.0])
+
+    def _reading_noise(self, y: F64, values: F64) -> float:
+        """deg, beyond the step's own: from row to row the gyro hardly wanders, so the differences are the readings'."""
+        if self.readings is None or len(values) == 1:
+            return 0.0
+        moving = self.rows.after >= 0
+        error = ((y - values[0]) / values[1] - self.rate)[moving] * self.rows.dt_s[moving]
+        excess = float(np.mean(error**2)) / 2.0 - self.readings.step_deg**2 / 12.0
+        return float(np.sqrt(max(excess, 0.0)))
+
+    def _at(self, sites: Sites) -> "Design":
+        """The same rows with other readings."""
+        rows = replace(self.rows, reading_variance=sites.variance)
+        return replace(self, rows=rows, rate=_slopes(rows, sites.level_deg))
+
+    def _sharpened(self, y: F64, columns: F64, values: F64, noise: RowNoise, sites: Sites | None) -> Sites:
+        """One round of the codes' likelihood about the path that the fit implies."""
+        readings, rows = self.readings, self.rows
+        assert readings is not None
+        if sites is None:
+            sites = Sites(readings.angle_deg, rows.reading_variance + noise.reading_deg**2, 0.0)
+        whitener = Whitener(rows, values[1], noise)
+        pull = rows.to_readings(whitener.precision_times(whitener.whiten(y - columns @ values)))
+        smooth = sites.level_deg - values[1] * sites.variance * pull
+        ending, _ = rows.ends
+        density = noise.white**2 * rows.sample_s + 2.0 * noise.ar1**2 * noise.correlation_time_s
+        step_variance = density * rows.dt_s[ending] / values[1] ** 2
+        variance = path_variance(sites.variance, ending >= 0, step_variance)
+        return sharpen(readings.angle_deg, readings.step_deg, smooth, variance, sites)
 
     def estimate(self, y: F64, columns: F64, noise: RowNoise, values: F64) -> tuple[F64, F64]:
         """Parameters (p,) and covariance (p, p) for given noise, from the start ``values``.
@@ -159,7 +203,9 @@ class Design:
         With r = y - Xb and C = cov of the encoder's errors in the rate, the score of r'Σ⁻¹r in S is x'Σ⁻¹r + S·h'Ch,
         h = Σ⁻¹r: the second term is what x'Σ⁻¹r owes to the error that x and r share.
         """
-        weighted = replace(self.rows, reading_variance=self.rows.reading_variance * self.recurrence)
+        weighted = self.rows
+        if self.readings is not None:
+            weighted = replace(weighted, reading_variance=weighted.reading_variance * self.readings.recurrence)
         values = values.copy()
         for _ in range(3):
             scale_factor = values[1] if len(values) > 1 else 0.0
@@ -177,9 +223,13 @@ class Design:
                 break
         return values, covariance
 
-    def chi2(self, y: F64, columns: F64, noise: RowNoise, values: F64) -> float:
-        """χ² of the residual, each reading with its own variance however often its codes recur."""
-        white = Whitener(self.rows, values[1] if len(values) > 1 else 0.0, noise).whiten(y - columns @ values)
+    def chi2(self, y: F64, columns: F64, noise: RowNoise, values: F64, softness: float) -> float:
+        """χ² of the residual, the readings taken as the codes' middles with the variance of one reading."""
+        rows = self.rows
+        if self.readings is not None and self.readings.step_deg > 0.0:
+            one = self.readings.step_deg**2 * (1.0 / 12.0 + softness**2)
+            rows = replace(rows, reading_variance=np.full(len(rows.reading_variance), one))
+        white = Whitener(rows, values[1] if len(values) > 1 else 0.0, noise).whiten(y - columns @ values)
         return float(white @ white)
 
 
@@ -191,6 +241,15 @@ class Solution:
     covariance: F64
     delay_s: float
     noise: NoiseFit
+    sites: Sites | None
+
+
+def _slopes(rows: Rows, level_deg: F64) -> F64:
+    """(n,) mean rate between the readings' levels (m,); zero in rows without readings."""
+    moving = rows.after >= 0
+    rate = np.zeros(len(rows))
+    rate[moving] = (level_deg[rows.after[moving]] - level_deg[rows.before[moving]]) / rows.dt_s[moving]
+    return rate
 
 
 def _inverse(gram: F64) -> F64:
@@ -210,7 +269,9 @@ def _report(design: Design, solution: Solution) -> Fit:
     elif design.reference == "encoder":
         warnings.append({"code": "fit.nothing_moved", "values": {}})
     p, noise = len(names), solution.noise.noise
-    chi2 = design.chi2(solution.y, solution.columns, noise, solution.values)
+    softness = solution.sites.softness if solution.sites else 0.0
+    columns = design.columns(solution.delay_s, float(solution.values[-1]))
+    chi2 = design.chi2(solution.y, columns, noise, solution.values, softness)
     dof = _effective_dof(design, solution)
     s = design.averages.samples
     return Fit(
@@ -231,20 +292,20 @@ def _report(design: Design, solution: Solution) -> Fit:
         rows=len(design.rows),
         samples=len(s.time_s),
         duration_s=float(s.time_s[-1] - s.time_s[0]),
-        encoder_step_deg=design.encoder_step_deg,
+        encoder_step_deg=design.readings.step_deg if design.readings else 0.0,
         warnings=tuple(warnings),
     )
 
 
 def _effective_dof(design: Design, solution: Solution) -> F64:
     """Satterthwaite: 2·var²/variance(var), by the change of each variance with the noise parameters."""
-    h = 0.1
+    h, noise = 0.1, solution.noise
+    if solution.sites is not None:
+        design = design._at(solution.sites)
     variance = np.diag(solution.covariance)
-    slope = np.empty((len(variance), len(solution.noise.parameters)))
+    slope = np.empty((len(variance), len(noise.logarithms)))
     for k, e in enumerate(h * np.eye(slope.shape[1])):
-        moved = design.estimate(
-            solution.y, solution.columns, solution.noise.at(solution.noise.parameters + e), solution.values
-        )
+        moved = design.estimate(solution.y, solution.columns, noise.at(noise.logarithms + e), solution.values)
         slope[:, k] = (np.diag(moved[1]) - variance) / h
-    spread = np.einsum("ij,jk,ik->i", slope, solution.noise.covariance, slope)
+    spread = np.einsum("ij,jk,ik->i", slope, noise.covariance, slope)
     return np.asarray(2.0 * variance**2 / np.maximum(spread, 1e-300))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,69 +15,89 @@ MAX_ROWS = 24_000
 """Longer records are sampled in blocks: that many rows know the noise to a per cent."""
 BLOCK = 3_000
 AR1_EVIDENCE = 8.0
-"""2ΔlnL that two more parameters must buy."""
+"""2ΔlnL that the two parameters of AR(1) noise must buy."""
 MAX_CORRELATION_S = 5.0
 """φ = 0.998 at 100 Hz; slower than this is not noise but a wandering bias."""
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    noise: RowNoise
-    parameters: F64
-    """(k,) ln white [, ln ar1, ln correlation time]."""
+    """Estimated logarithms of some fields of ``RowNoise``, the others staying as in ``base``."""
+
+    base: RowNoise
+    fields: tuple[str, ...]
+    logarithms: F64
+    """(k,) ln of those fields."""
     covariance: F64
-    """(k, k) of the parameters."""
+    """(k, k) of the logarithms."""
 
-    def at(self, parameters: F64) -> RowNoise:
-        return _noise(parameters)
+    def at(self, logarithms: F64) -> RowNoise:
+        """The noise at other values of the logarithms (k,)."""
+        values = np.exp(np.clip(logarithms, -60.0, 60.0)).tolist()
+        noise = replace(self.base, **dict(zip(self.fields, values, strict=True)))
+        return replace(noise, correlation_time_s=min(max(noise.correlation_time_s, 1e-3), MAX_CORRELATION_S))
+
+    @property
+    def noise(self) -> RowNoise:
+        return self.at(self.logarithms)
 
 
-def fit_noise(rows: Rows, y: F64, columns: F64, scale_factor: float) -> NoiseFit:
-    """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p)."""
+def fit_noise(rows: Rows, y: F64, columns: F64, scale_factor: float, start: RowNoise) -> NoiseFit:
+    """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p).
+
+    The error of readings is estimated too where ``start.reading_deg`` is not 0.
+    """
     n = len(rows)
     if n > MAX_ROWS:
-        starts = np.linspace(0, n - BLOCK, MAX_ROWS // BLOCK).astype(int)
-        chosen = np.unique((starts[:, None] + np.arange(BLOCK)).ravel())
+        begin = np.linspace(0, n - BLOCK, MAX_ROWS // BLOCK).astype(int)
+        chosen = np.unique((begin[:, None] + np.arange(BLOCK)).ravel())
         rows, y, columns = rows.take(chosen), y[chosen], columns[chosen]
     columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
     both = np.column_stack([columns / np.sqrt((columns**2).mean(axis=0)), y])
 
-    def deviance(parameters: F64) -> float:
-        """-2 ln of the restricted likelihood, up to a constant."""
-        whitener = Whitener(rows, scale_factor, _noise(parameters))
-        white = whitener.whiten(both)
-        gram = white.T @ white
-        upper = np.linalg.cholesky(gram).T
-        return whitener.log_determinant + 2.0 * float(np.log(np.diag(upper)[:-1]).sum()) + float(upper[-1, -1] ** 2)
+    def deviance_of(fit: NoiseFit) -> Callable[[F64], float]:
+        def deviance(logarithms: F64) -> float:
+            """-2 ln of the restricted likelihood, up to a constant."""
+            whitener = Whitener(rows, scale_factor, fit.at(logarithms))
+            white = whitener.whiten(both)
+            diagonal = np.diag(np.linalg.cholesky(white.T @ white))
+            return float(whitener.log_determinant + 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2)
 
-    white = np.array([math.log(_first_guess(rows, y))])
-    white, low, curvature = _minimise(deviance, white)
-    start = min(
-        (np.array([white[0] + math.log(a), white[0] + math.log(b), math.log(tau)]) for a, b in ((0.95, 0.3), (0.8, 0.6))
-         for tau in (0.05, 0.3, 2.0)),
-        key=deviance,
-    )  # fmt: skip
-    if deviance(start) < low + 2.0:
-        coloured, lower, curve = _minimise(deviance, start)
-        if lower < low - AR1_EVIDENCE:
-            white, curvature = coloured, curve
-    return NoiseFit(_noise(white), white, 2.0 * np.linalg.inv(curvature))
+        return deviance
+
+    def fitted(fields: tuple[str, ...], values: list[float]) -> tuple[NoiseFit, float]:
+        fit = NoiseFit(start, fields, np.log(values), np.empty((0, 0)))
+        logarithms, deviance, curvature = _minimise(deviance_of(fit), fit.logarithms)
+        return replace(fit, logarithms=logarithms, covariance=2.0 * np.linalg.inv(curvature)), deviance
+
+    fields = ("white", "reading_deg") if start.reading_deg > 0.0 else ("white",)
+    if start.ar1 > 0.0:
+        coloured = (*fields, "ar1", "correlation_time_s")
+        return fitted(coloured, [getattr(start, field) for field in coloured])[0]
+    plain, low = fitted(fields, [getattr(start, field) for field in fields])
+    base = plain.noise
+    trial = replace(plain, fields=("white", "ar1", "correlation_time_s"), base=base)
+    deviance = deviance_of(trial)
+    guesses = [
+        np.log([share * base.white, math.sqrt(1.0 - share**2) * base.white, tau])
+        for share in (0.95, 0.8)
+        for tau in (0.05, 0.3, 2.0)
+    ]
+    guess = min(guesses, key=deviance)
+    if deviance(guess) > low + 2.0:
+        return plain
+    white, ar1, tau = np.exp(guess).tolist()
+    known = {"white": white, "reading_deg": base.reading_deg, "ar1": ar1, "correlation_time_s": tau}
+    coloured = (*fields, "ar1", "correlation_time_s")
+    better, lower = fitted(coloured, [known[field] for field in coloured])
+    return better if lower < low - AR1_EVIDENCE else plain
 
 
-def _noise(parameters: F64) -> RowNoise:
-    white = math.exp(float(np.clip(parameters[0], -60.0, 60.0)))
-    if len(parameters) == 1:
-        return RowNoise(white)
-    ar1, tau = np.exp(np.clip(parameters[1:], -60.0, 60.0))
-    return RowNoise(white, float(ar1), float(np.clip(tau, 1e-3, MAX_CORRELATION_S)))
-
-
-def _first_guess(rows: Rows, y: F64) -> float:
-    """From third differences, which smooth motion hardly enters: an upper limit with an encoder, close without."""
+def first_guess(rows: Rows, y: F64) -> float:
+    """White noise from third differences of ``y`` (n,), which smooth motion hardly enters."""
     still = rows.after < 0
-    if still.sum() < 50:
-        return float(np.std(np.diff(y, 3)) / math.sqrt(20.0)) or 1e-9
-    return float(np.std(np.diff(y[still], 3)) / math.sqrt(20.0)) or 1e-9
+    chosen = y[still] if still.sum() > 50 else y
+    return max(float(np.std(np.diff(chosen, 3))) / math.sqrt(20.0), 1e-12)
 
 
 def _minimise(function: Callable[[F64], float], x: F64) -> tuple[F64, float, F64]:
@@ -102,6 +122,6 @@ def _minimise(function: Callable[[F64], float], x: F64) -> tuple[F64, float, F64
             step /= 3.0
         if after <= value:
             x, value = x + step, after
-        if np.abs(step).max() < 0.01:
+        if np.abs(step).max() < 0.02:
             break
-    return x, value, (vectors * power) @ vectors.T
+    return x, value, np.asarray((vectors * power) @ vectors.T)

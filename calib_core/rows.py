@@ -129,8 +129,8 @@ def with_reference(s: Samples, rate_dps: F64) -> tuple[Rows, Averages, F64]:
     return rows, Averages(s, time, time, at), rate[at]
 
 
-def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, F64, encoder_noise.Readings]:
-    """Rows between encoder readings, one per sample inside rests: rows, averages, mean rate (n,), the readings used.
+def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, encoder_noise.Readings]:
+    """Rows between encoder readings, one per sample inside rests; and the readings used, a rest's as one.
 
     ``time_s``, ``angle_deg`` (m,) are all readings of the recording; those outside the samples' stretches are left out.
     """
@@ -148,34 +148,28 @@ def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Average
     # One reading for each moving reading, one for each rest.
     rest = readings.rest
     new = (rest < 0) | (np.diff(rest, prepend=-1) != 0) | (np.diff(k, prepend=-1) != 0)
-    reading = np.cumsum(new) - 1
-    join = np.flatnonzero((np.diff(reading) == 1) & (np.diff(k) == 0))
-    moves = _pieces(time[join], time[join + 1], reading[join], reading[join + 1], np.full(len(join), -1))
+    number = np.cumsum(new) - 1
+    join = np.flatnonzero((np.diff(number) == 1) & (np.diff(k) == 0))
+    none = np.full(len(join), -1)
+    moving = np.array([time[join], time[join + 1], number[join], number[join + 1], none], dtype=float)
 
-    # Rests: the samples whose whole interval lies inside.
+    # In rests, the samples whose whole interval lies inside.
     begin = np.flatnonzero(new & (rest >= 0))
-    end = np.append(np.flatnonzero(new)[1:], len(time))[reading[begin]] - 1
+    end = np.append(np.flatnonzero(new)[1:], len(time))[number[begin]] - 1
     half = s.interval_s / 2.0
     low, high = np.searchsorted(s.time_s, time[begin] + half), np.searchsorted(s.time_s, time[end] - half)
-    at = np.concatenate([np.arange(a, b) for a, b in zip(low, high, strict=True)] or [np.empty(0, int)]).astype(int)
+    inside = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    at = np.concatenate(inside).astype(np.int64) if inside else np.empty(0, np.int64)
     none = np.full(len(at), -1)
-    stills = _pieces(s.time_s[at], s.time_s[at], none, none, at)
+    still = np.array([s.time_s[at], s.time_s[at], none, none, at], dtype=float)
 
-    begin_s, end_s, before, after, at = (np.concatenate(pair) for pair in zip(moves, stills, strict=True))
+    pieces = np.concatenate([moving, still], axis=1)
+    begin_s, end_s, *numbers = pieces[:, np.argsort(pieces[0] + pieces[1], kind="stable")]
+    before, after, at = (x.astype(np.int64) for x in numbers)
     middle = (begin_s + end_s) / 2.0
-    order = np.argsort(middle, kind="stable")
-    begin_s, end_s, before, after, at, middle = (x[order] for x in (begin_s, end_s, before, after, at, middle))
-    number = stretch[np.clip(np.searchsorted(s.time_s, middle, side="right") - 1, 0, None)]
     dt = np.where(at >= 0, s.interval_s, end_s - begin_s)
-    moving = at < 0
-    rate = np.zeros(len(at))
-    level = angle[new]
-    rate[moving] = (level[after[moving]] - level[before[moving]]) / dt[moving]
-    start = np.diff(number, prepend=-1) != 0
-    rows = Rows(middle, dt, start, before, after, readings.variance[new], s.interval_s)
-    kept = encoder_noise.Readings(readings.step_deg, readings.run[new], readings.recurrence[new], rest[new])
-    return rows, Averages(s, begin_s, end_s, at), rate, kept
-
-
-def _pieces(begin_s: F64, end_s: F64, before: Ints, after: Ints, at: Ints) -> tuple[F64, F64, Ints, Ints, Ints]:
-    return begin_s, end_s, before, after, at
+    inside = stretch[np.clip(np.searchsorted(s.time_s, middle, side="right") - 1, 0, None)]
+    start = np.diff(inside, prepend=-1) != 0
+    kept = readings.take(new)
+    rows = Rows(middle, dt, start, before, after, kept.variance, s.interval_s)
+    return rows, Averages(s, begin_s, end_s, at), kept

@@ -15,6 +15,9 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+TAIL = 512
+"""Rows after a rest over which its error is followed first; doubled until it has faded."""
+
 
 @dataclass(frozen=True)
 class RowNoise:
@@ -23,6 +26,8 @@ class RowNoise:
     white: float
     ar1: float = 0.0
     correlation_time_s: float = 0.5
+    reading_deg: float = 0.0
+    """Independent error of each encoder reading, beside the variance that the rows bring."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +69,11 @@ class Rows:
         """(m,) how the readings' errors (deg) meet ``values`` (n,): the adjoint of errors -> rows, for S = 1."""
         ending, beginning = self.ends
         per_dt = np.append(values / self.dt_s, 0.0)  # index -1 finds the zero
-        return per_dt[beginning] - per_dt[ending]
+        return np.asarray(per_dt[beginning] - per_dt[ending])
 
 
 class Whitener:
-    """Σ⁻¹ of the rows' errors for a given S and noise, as a square root: ``whiten`` makes errors white with unit variance.
+    """Σ⁻¹ of the rows' errors for a given S and noise, as a square root: ``whiten`` gives white errors of variance 1.
 
     AR(1) noise is first made short-ranged by y_j - φ·y_{j-1}; what remains has a covariance of bandwidth 2, factorised
     by LAPACK. The error of a rest's reading ties together two rows far apart, its entry and its exit; those few are
@@ -93,7 +98,7 @@ class Whitener:
 
         ending, beginning = rows.ends
         near = (ending < 0) | (beginning < 0) | (beginning == ending + 1)
-        sigma = abs(scale_factor) * np.sqrt(rows.reading_variance)
+        sigma = abs(scale_factor) * np.sqrt(rows.reading_variance + noise.reading_deg**2)
         inverse_dt = np.append(1.0 / rows.dt_s, 0.0)
         for group in (near & (ending >= 0), near & (ending < 0) & (beginning >= 0)):
             e, b, s = ending[group], beginning[group], sigma[group]
@@ -108,51 +113,70 @@ class Whitener:
             band = band[:2]  # without φ nothing reaches two rows
         self._factor = cholesky_banded(band[:, :n], lower=True, check_finite=False, overwrite_ab=True)
         self.log_determinant = 2.0 * float(np.log(self._factor[0]).sum())
-        self._far = None
+        self._far: list[tuple[slice, F64]] = []
         far = np.flatnonzero(~near)
         if len(far):
             self._add_rests(ending[far], beginning[far], sigma[far])
 
     def _add_rests(self, entry: Ints, leave: Ints, sigma: F64) -> None:
-        """Σ += Σ_k u_k·u_kᵀ: u_k is the error of rest k, seen in its entry row and, reversed, in its exit row."""
-        n, k = len(self._rows), np.arange(len(entry))
-        u = np.zeros((n, len(entry)), order="F")
-        u[entry, k] = -sigma / self._rows.dt_s[entry]
-        u[leave, k] = sigma / self._rows.dt_s[leave]
-        c = self._lower(self._filter(u))
-        power, vectors = np.linalg.eigh(c.T @ c)
-        shrink = vectors * (-np.expm1(-0.5 * np.log1p(power)) / np.maximum(power, 1e-300)) @ vectors.T
-        self._far = (c, shrink)
+        """Σ += Σ_k u_k·u_kᵀ: u_k is the error of rest k, seen in its entry row and, reversed, in its exit row.
+
+        Whitened, u_k is nothing before its entry and fades after its exit, so only that stretch is kept. With G the
+        Gram matrix of the whitened u, the square root is 1 - u·W·uᵀ for W = (1 - (1 + G)^-½)/G.
+        """
+        rows, n, k = self._rows, len(self._rows), len(entry)
+        for e, x, s in zip(entry.tolist(), leave.tolist(), sigma.tolist(), strict=True):
+            length, stop = TAIL, 0
+            while stop < n:
+                stop = min(n, x + length)
+                u = np.zeros(stop - e)
+                u[0], u[x - e] = -s / rows.dt_s[e], s / rows.dt_s[x]
+                u = self._lower(self._filter(u, slice(e, stop)), slice(e, stop))
+                if np.abs(u[-8:]).max() < 1e-6 * np.abs(u).max():
+                    break
+                length *= 2
+            self._far.append((slice(e, stop), u))
+        gram = np.zeros((k, k))
+        for i, (a, u) in enumerate(self._far):
+            for j in range(i, k):
+                b, v = self._far[j]
+                if b.start >= a.stop:
+                    break
+                stop = min(a.stop, b.stop)
+                gram[i, j] = gram[j, i] = u[b.start - a.start : stop - a.start] @ v[: stop - b.start]
+        power, vectors = np.linalg.eigh(gram)
+        power = np.maximum(power, 1e-300)
+        self._weight = vectors * (-np.expm1(-0.5 * np.log1p(power)) / power) @ vectors.T
         self.log_determinant += float(np.log1p(power).sum())
 
     def whiten(self, columns: F64) -> F64:
         """(n,) or (n, p) in, the same shape out."""
-        columns = self._lower(self._filter(columns))
-        return self._shrink(columns)
+        return self._shrink(self._lower(self._filter(columns)))
 
     def precision_times(self, white: F64) -> F64:
         """Σ⁻¹·x (n,) for a column that ``whiten`` turned into ``white``."""
-        from scipy.linalg.lapack import dtbtrs
-
-        values, _ = dtbtrs(self._factor, self._shrink(white), uplo="L", trans="T")
-        out: F64 = values.reshape(white.shape).copy()
-        out[:-1] -= self._phi[1:] * out[1:].copy()
+        out = self._lower(self._shrink(white), transposed=True)
+        out[:-1] -= self._phi[1:] * out[1:]
         return out
 
-    def _filter(self, columns: F64) -> F64:
+    def _filter(self, columns: F64, rows: slice = slice(None)) -> F64:
+        """y_j - φ·y_{j-1} over ``rows``; before the first there is nothing."""
         out = np.array(columns, dtype=float, order="F")
-        phi = self._phi[1:] if columns.ndim == 1 else self._phi[1:, None]
-        out[1:] -= phi * columns[:-1]
+        phi = self._phi[rows][1:]
+        out[1:] -= (phi if columns.ndim == 1 else phi[:, None]) * columns[:-1]
         return out
 
-    def _lower(self, columns: F64) -> F64:
+    def _lower(self, columns: F64, rows: slice = slice(None), *, transposed: bool = False) -> F64:
         from scipy.linalg.lapack import dtbtrs
 
-        solved, _ = dtbtrs(self._factor, columns, uplo="L", overwrite_b=True)
+        solved, _ = dtbtrs(self._factor[:, rows], columns, uplo="L", trans="T" if transposed else "N")
         return np.asarray(solved, dtype=float).reshape(columns.shape)
 
     def _shrink(self, columns: F64) -> F64:
-        if self._far is None:
+        if not self._far:
             return columns
-        c, shrink = self._far
-        return np.asarray(columns - c @ (shrink @ (c.T @ columns)))
+        out = columns.copy()
+        overlap = np.array([u @ columns[a] for a, u in self._far])
+        for (a, u), weight in zip(self._far, self._weight @ overlap, strict=True):
+            out[a] -= np.multiply.outer(u, weight)
+        return out
