@@ -170,7 +170,7 @@ def model_of(recording: Recording) -> GyroModel:
 # --- estimate states ---------------------------------------------------------------------------------------------
 def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroModel) -> Result:
     """Integral fit and adaptive estimate of the last ``estimate_<axis>``, with the hold before it."""
-    whole, motion = _motion(recording, axis)
+    whole, motion = motion_of(recording, axis)
     fit = integral_fit.fit(whole, axis)
     _check_answer(fit, axis, gyro_model)
     hold = whole.gyro(axis).values[: len(whole) - len(motion)]
@@ -238,7 +238,7 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
     )
 
 
-def _motion(recording: Recording, axis: str) -> tuple[Recording, Recording]:
+def motion_of(recording: Recording, axis: str) -> tuple[Recording, Recording]:
     """The last ``estimate_<axis>`` with the hold before it, and without."""
     runs = recording.runs()
     last = max((i for i, run in enumerate(runs) if run.name == f"estimate_{axis}"), default=None)
