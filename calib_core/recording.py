@@ -194,13 +194,16 @@ def read(
 ) -> Recording:
     """A checked Recording from CSV, gzipped CSV or Parquet, told apart by their first bytes.
 
-    ``mapping`` renames foreign columns, ``{"their name": "x_gyro_dps"}``. ``name`` is the file's, for sentences.
-    Raises Problem ``recording.…`` with ``line`` and ``column`` where they apply; a Parquet file's line is its row,
-    counted from 1. A ``gyro-points 1`` file is refused: ``points.read`` takes it.
+    ``mapping`` renames foreign columns, ``{"their name": "x_gyro_dps"}``. Raises Problem
+    ``recording.…`` with ``file`` = ``name``, and ``line`` and ``column`` where they apply; a Parquet file's line is its
+    row, counted from 1. A ``gyro-points 1`` file is refused: ``points.read`` takes it.
     """
     from calib_core.recording_file import read_any
 
-    return read_any(data, name=name, mapping=mapping or {}, max_bytes=max_bytes)
+    try:
+        return read_any(data, mapping=mapping or {}, max_bytes=max_bytes)
+    except Problem as problem:
+        raise Problem(problem.code, **{**problem.values, "file": name}) from None
 
 
 def write_csv(recording: Recording, file: BinaryIO) -> None:

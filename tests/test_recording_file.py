@@ -233,6 +233,24 @@ def test_every_round_trip_gives_the_same_recording(recording: Recording) -> None
     assert to_csv(read(text)) == text
 
 
+@pytest.mark.parametrize(
+    "write", [to_csv, lambda r: gzip.compress(to_csv(r)), to_parquet], ids=["csv", "gz", "parquet"]
+)
+def test_damage_anywhere_ends_in_a_sentence(write: Callable[[Recording], bytes]) -> None:
+    good = write(read(csv_bytes(csv_lines())))
+    rng = np.random.default_rng(7)
+    refused = 0
+    for _ in range(150):
+        data = bytearray(good)
+        for at in rng.integers(0, len(good), rng.integers(1, 4)):
+            data[at : at + rng.integers(0, 3)] = rng.choice([b'"', b",", b"\n", b"#", b"\0", b"\xff", b"-1e9", b""])
+        try:
+            read(bytes(data))
+        except Problem:
+            refused += 1
+    assert refused > 75
+
+
 @settings(max_examples=60, deadline=None)
 @given(recordings())
 def test_the_fast_reader_agrees_with_the_careful_one(recording: Recording) -> None:
