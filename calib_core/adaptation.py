@@ -78,8 +78,25 @@ class Adapter:
 def adapt(
     output: F64, rate: F64, dt: float, *, gamma1: float, gamma2: float, bias: float, scale_factor: float
 ) -> tuple[F64, F64]:
-    """The whole record at once: traces of bias and scale factor, (n,) each."""
-    return Adapter(gamma1, gamma2, dt, bias, scale_factor).update(output, rate)
+    """The whole record at once: traces of bias and scale factor, (n,) each; what ``Adapter`` gives in pieces.
+
+    The rule is linear in what it adapts, so its trace solves one lower-banded system, unknowns β̂₀, Ŝ₀, β̂₁, Ŝ₁ …
+    """
+    from scipy.linalg.lapack import dtbtrs
+
+    missing = np.isnan(output) | np.isnan(rate)
+    y, w = np.where(missing, 0.0, output), np.where(missing, 0.0, rate)
+    of_bias, of_scale = gamma1 * dt * ~missing, gamma2 * dt * w  # the gains of each row
+    known = np.stack([of_bias * y, of_scale * y], axis=1)
+    known[0] += bias, scale_factor
+    known[0] -= (scale_factor * w[0] + bias) * np.array([of_bias[0], of_scale[0]])
+    band = np.zeros((2 * len(y), 4))  # each row an unknown: its diagonal and where it enters the next three equations
+    band[1:-1:2, 1] = (of_bias * w)[1:]
+    band[:-2:2, 2] = of_bias[1:] - 1.0
+    band[1:-2:2, 2] = (of_scale * w)[1:] - 1.0
+    band[:-2:2, 3] = of_scale[1:]
+    trace, _ = dtbtrs(band.T, known.reshape(-1, 1), uplo="L", diag="U", overwrite_b=True)
+    return trace[::2, 0], trace[1::2, 0]
 
 
 def adapt_many(

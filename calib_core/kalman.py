@@ -8,6 +8,7 @@ State 1 is the slope of V. The thesis calls it beta; it is not the bias.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,23 +215,29 @@ def filter_record(v: F64, dt: float, gain: Gain) -> F64:
     return Filter(gain, dt).update(v)
 
 
-def filterpy_difference(v: F64, dt: float, gain: Gain) -> float:
-    """Largest difference (V) from filterpy's filter, from the same start: the check of record (METHOD 1).
-
-    Meant for the first 1000 samples of an estimate state, which hold the whole transient; past 1e-9 is a warning.
-    """
+def reference_filter(gain: Gain, dt: float, first: float) -> Any:
+    """filterpy's filter of the same model, started as ``Filter`` is at its first sample (V)."""
     from filterpy.kalman import KalmanFilter
 
-    v = v[np.argmax(~np.isnan(v)) :]
     twin = _twin(gain, dt)
     variance = gain.r / dt
     reference = KalmanFilter(dim_x=2, dim_z=1)
-    reference.x = np.array([[0.0], [v[0]]])
+    reference.x = np.array([[0.0], [first]])
     reference.P = np.diag([twin.prior[0], 1.0]) * variance
     reference.F = np.array([[1.0, 0.0], [dt, 1.0]])
     reference.H = np.array([[0.0, 1.0]])
     reference.Q = np.array([[twin.q[0], twin.q[1]], [twin.q[1], twin.q[2]]]) * variance
     reference.R = np.array([[variance]])
+    return reference
+
+
+def filterpy_difference(v: F64, dt: float, gain: Gain) -> float:
+    """Largest difference (V) from filterpy's filter, from the same start: the check of record (METHOD 1).
+
+    Meant for the first 1000 samples of an estimate state, which hold the whole transient; past 1e-9 is a warning.
+    """
+    v = v[np.argmax(~np.isnan(v)) :]
+    reference = reference_filter(gain, dt, float(v[0]))
     expected = [v[0]]
     for z in v[1:].tolist():
         reference.predict()

@@ -1,0 +1,35 @@
+"""`gyrobench bench`: the project's benchmarks, ratios side by side."""
+
+import argparse
+import json
+import os
+import sys
+
+from server.bench import SUBJECTS, Row, run, table
+
+EXAMPLE = "gyrobench bench core --json"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help=f"{', '.join(SUBJECTS)} (default: all of them)")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions and seeds")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
+
+
+def main(args: argparse.Namespace) -> int:
+    # Small products on shared cores: a second BLAS thread costs more than it brings (METHOD 3). Before numpy comes in.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    measured: dict[str, list[Row]] = {}
+    for name in [args.name] if args.name else SUBJECTS:
+        measured[name] = rows = []
+        for row in run(name, quick=args.quick):
+            rows.append(row)
+            if sys.stderr.isatty():
+                print(f"\r\033[K{name}: {row.name}", end="", file=sys.stderr, flush=True)
+        if sys.stderr.isatty():
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+        if not args.json:
+            print(f"{name}\n{table(rows)}", flush=True)
+    if args.json:
+        print(json.dumps({name: [row.to_json() for row in rows] for name, rows in measured.items()}))
+    return 0
