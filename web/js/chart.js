@@ -148,7 +148,8 @@ export function chart(place, spec) {
   const state = { band: null, note: null, range: null, zoom: null };
   const group = spec.group ?? Symbol("alone");
   if (!groups.has(group)) groups.set(group, new Set());
-  const room = Math.max(...spec.series.map((series) => (series.name ? widthOf(series.name) + 26 : 8)));
+  // Pictures above each other share their time axis, so their names get the same room.
+  const room = Math.max(innerWidth > 720 ? 92 : 0, ...spec.series.map((series) => (series.name ? widthOf(series.name) + 26 : 8)));
   let plot = null;
 
   function zoom(range) {

@@ -5,6 +5,7 @@ import { clock, t } from "./text.js";
 
 const ROWS = 8192;      // more than two minutes at 50 rows/s
 const RETRY_MS = [500, 1000, 2000, 4000];
+const NO_SUCH_RUN = 4404;
 const ENDED = new Set(["finished", "stopped", "failed", "interrupted"]);
 
 /** u32 length, JSON, then Float64 arrays back to back in the order of `arrays`. */
@@ -76,8 +77,9 @@ export function watch(run, { onFrame, onConnection }) {
       soFar.take(frame);
       onFrame(soFar, frame);
     };
-    socket.onclose = () => {
+    socket.onclose = ({ code, reason }) => {
       if (isClosed || soFar.ended) return;
+      if (code === NO_SUCH_RUN) { onConnection(reason); return; }
       if (!tries) onConnection(t("live.lost", { time: clock() }));
       setTimeout(connect, RETRY_MS[Math.min(tries++, RETRY_MS.length - 1)]);
     };

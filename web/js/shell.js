@@ -44,7 +44,7 @@ export function fault(problem) {
 
 export function rigSentence(rig) {
   const name = rig.simulated ? t("rig.simulated_at", { speed: speedWord(rig.speed) }) : rig.url;
-  const holder = api.holdsRig() ? t("rig.you_hold") : rig.lease ? t("rig.held_by", { holder: rig.lease.holder }) : t("rig.free");
+  const holder = rig.run ? t("rig.in_use") : api.holdsRig() ? t("rig.you_hold") : rig.lease ? t("rig.held_by", { holder: rig.lease.holder }) : t("rig.free");
   return `${name} · ${rig.connected ? t("rig.connected") : t("rig.not_connected")} · ${holder}`;
 }
 

@@ -42,7 +42,7 @@ export function sentence({ code, values, sentence: said }) {
 
 export const has = (key) => typeof lookup(texts, key) === "string";
 
-/** Fills data-t="key" and data-t-placeholder="key", data-t-aria-label="key" … below root. */
+/** Below root: the key in data-t becomes the text, those in data-t-placeholder, data-t-aria-label … the attributes. */
 export function translate(root = document) {
   for (const node of root.querySelectorAll("[data-t]")) node.textContent = t(node.dataset.t);
   for (const attribute of ["placeholder", "aria-label", "title", "content"]) {

@@ -1,0 +1,112 @@
+"""The other pages: language, phone width, lists, comparison, a run's own page."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import PHONE, Server, Window, chromium, serving
+
+PAGES = ("/", "/run.html", "/boards.html", "/certificates.html", "/compare.html", "/rig.html", "/thesis.html")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("data")) as server:
+        for board in ("LPY-A", "LPY-B"):
+            server.call("POST", "/runs", {"board": board, "readings": 3, "seed": 1})
+            server.wait_idle()
+        yield server
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def window(browser: Any, server: Server) -> Iterator[Window]:
+    window = Window(browser, server)
+    yield window
+    window.close()
+
+
+def test_language_switch_is_kept_and_sets_the_page_language(window: Window) -> None:
+    page = window.open("/boards.html")
+    assert window.text("h1") == "Boards"
+    page.click("button[lang=th]")
+    page.wait_for_selector("html[lang=th][data-ready]")
+    window.open("/certificates.html")
+    assert window.text("h1") == "ใบรับรอง"
+    assert page.locator("button[lang=th]").get_attribute("aria-pressed") == "true"
+
+
+@pytest.mark.parametrize("locale", ["en-US", "th-TH"])
+def test_no_page_scrolls_sideways_on_a_phone(browser: Any, server: Server, locale: str) -> None:
+    window = Window(browser, server, viewport=PHONE, locale=locale)
+    run = server.call("GET", "/runs")["items"][0]["id"]
+    for path in (*PAGES, f"/run.html?id={run}", "/boards.html?id=LPY-A"):
+        page = window.open(path)
+        page.wait_for_load_state("networkidle")
+        assert window.widest() <= PHONE["width"], path
+        stop = page.locator(".stop").bounding_box()
+        assert stop["height"] >= 48
+        assert stop["y"] + stop["height"] <= PHONE["height"], f"{path}: the stop is not on the screen"
+    window.close()
+
+
+def test_search_finds_a_board_and_says_when_there_is_none(window: Window) -> None:
+    page = window.open("/boards.html")
+    page.fill("#search", "LPY-B")
+    page.wait_for_selector("tbody tr:only-child")
+    assert "LPY-B" in window.text("tbody")
+    page.fill("#search", "nothing like it")
+    page.wait_for_selector(".empty")
+    assert "nothing like it" in window.text(".empty")
+
+
+def test_certificate_is_verified_from_its_list(window: Window) -> None:
+    page = window.open("/certificates.html")
+    page.locator("tbody button").first.click()
+    page.wait_for_selector("output:has-text('same numbers')")
+
+
+def test_two_boards_stand_side_by_side(window: Window) -> None:
+    page = window.open("/compare.html?a=LPY-A&b=LPY-B")
+    page.wait_for_selector("table")
+    heads = page.locator("thead").first.inner_text()
+    assert all(column in heads for column in ("LPY-A x", "LPY-A z", "LPY-B x", "LPY-B z"))
+    assert page.locator("table").count() == 3
+
+
+def test_run_page_shows_results_pictures_and_the_raw_recording(window: Window, server: Server, tmp_path: Path) -> None:
+    run = server.call("GET", "/runs?q=LPY-A")["items"][0]["id"]
+    page = window.open(f"/run.html?id={run}")
+    page.wait_for_selector("#result-position_z")
+    page.wait_for_selector("#result-estimate_x .u-wrap >> nth=1")
+    assert page.locator(".error:not(:empty)").count() == 0
+    with page.expect_download() as download:
+        page.click("a[href$='.csv']:has-text('Raw')")
+    path = tmp_path / "run.csv"
+    download.value.save_as(path)
+    assert "x_gyro_v" in path.read_text(encoding="utf-8")[:3000]
+
+
+def test_one_state_is_repeated_and_the_others_are_kept(window: Window, server: Server) -> None:
+    run = server.call("GET", "/runs?q=LPY-A")["items"][0]["id"]
+    page = window.open(f"/run.html?id={run}")
+    page.click("#result-rate_z button")
+    page.wait_for_url("**/?run=*")
+    page.wait_for_selector("#again")
+    states = page.locator("#states li").all_inner_texts()
+    assert "kept" in states[0]
+    assert "done" in states[4]
+    server.wait_idle()
+
+
+def test_rig_page_names_every_part_and_its_state(window: Window) -> None:
+    page = window.open("/rig.html")
+    page.wait_for_selector(".parts li")
+    assert page.locator(".parts li").count() == 4
+    assert "RX-28" in window.text(".parts")
