@@ -31,7 +31,7 @@ class Row:
     def ok(self) -> bool:
         if self.limit is None:
             return True
-        return self.figure >= self.limit if self.at_least else self.figure <= self.limit
+        return bool(self.figure >= self.limit if self.at_least else self.figure <= self.limit)
 
     @property
     def ratio(self) -> float | None:
@@ -39,11 +39,11 @@ class Row:
         if self.limit is None:
             return None
         best, worst = (self.figure, self.limit) if self.at_least else (self.limit, self.figure)
-        return best / worst if worst else None
+        return float(best / worst) if worst else None
 
     def to_json(self) -> dict[str, object]:
         return {
-            "name": self.name, "figure": self.figure, "unit": self.unit, "limit": self.limit,
+            "name": self.name, "figure": float(self.figure), "unit": self.unit, "limit": self.limit,
             "at_least": self.at_least, "ratio": self.ratio, "ok": self.ok, "ours": self.ours, "theirs": self.theirs,
         }  # fmt: skip
 
