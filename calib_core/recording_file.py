@@ -199,7 +199,7 @@ def rows(table: TextTable) -> Iterator[tuple[int, list[str]]]:
 def _slow(table: TextTable, names: Sequence[str]) -> Recording:
     """The recording row by row; raises Problem at the first bad cell.
 
-    A foreign column of text that nobody asked for is left out.
+    A foreign column of text that nobody asked for is left out, and the header says so.
     """
     numbers = {name: array("d") for name in names}
     segments: dict[str, int] = {}
@@ -216,6 +216,7 @@ def _slow(table: TextTable, names: Sequence[str]) -> Recording:
                     raise Problem("recording.not_a_number", line=line, column=name, cell=cell[:40])
                 else:
                     del numbers[name]
+    header = with_left_out(table.header, [name for name in names if name not in numbers])
     numbers.pop("segment", None)
     columns = {name: np.frombuffer(values, np.float64) + 0.0 for name, values in numbers.items()}
     time_s = columns.pop("time_s")
@@ -224,8 +225,13 @@ def _slow(table: TextTable, names: Sequence[str]) -> Recording:
         columns,
         np.array(codes if codes else np.zeros(len(time_s)), np.int32),
         tuple(segments) or ("",),
-        table.header,
+        header,
     )
+
+
+def with_left_out(header: Mapping[str, str], names: Sequence[str]) -> Mapping[str, str]:
+    """The header with a line that names the columns left out, if there are any."""
+    return {**header, "left_out": listed(names)} if names else header
 
 
 def number(cell: str) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 from calib_core.problem import Problem
 from calib_core.recording import I32, Recording
 from calib_core.recording_check import check, check_names, is_known
-from calib_core.recording_file import FORMAT, refuse_other_formats, rename
+from calib_core.recording_file import FORMAT, refuse_other_formats, rename, with_left_out
 
 _HEADER_KEY = b"gyro-recording"
 
@@ -31,7 +31,7 @@ def read(raw: bytes, *, mapping: Mapping[str, str], max_bytes: int) -> Recording
         raise Problem("recording.parquet_corrupt") from None
     if table is None:
         raise Problem("recording.too_large", limit_MB=max_bytes / 1e6)
-    header = _header(table.schema.metadata or {})
+    header: Mapping[str, str] = _header(table.schema.metadata or {})
     names = rename(table.column_names, mapping)
     refuse_other_formats(header, names)
     check_names(names)
@@ -45,6 +45,7 @@ def read(raw: bytes, *, mapping: Mapping[str, str], max_bytes: int) -> Recording
             numbers[name] = column.cast(pa.float64(), safe=False).to_numpy() + 0.0
         elif is_known(name):
             raise Problem("recording.not_a_number", line=1, column=name, cell=str(column.type))
+    header = with_left_out(header, [name for name in names if name not in numbers and name != "segment"])
     return check(Recording(numbers.pop("time_s"), numbers, codes, segments, header))
 
 

@@ -172,6 +172,7 @@ def test_foreign_columns_come_in_by_mapping() -> None:
     partial = read(foreign, mapping={"clock": "time_s", "gx": "x_gyro_v"})
     # Numbers of other names stay, text that nobody asked for goes.
     assert list(partial.columns) == ["x_gyro_v", "label"]
+    assert partial.header["left_out"] == "what"
 
 
 def test_what_spreadsheets_do_to_a_recording_does_no_harm() -> None:
