@@ -10,7 +10,8 @@ from shared import ROOT
 ALLOWED_IN_CORE = {
     "numpy", "scipy", "filterpy", "pyarrow", "calib_core", "__future__", "collections", "dataclasses", "enum", "functools",
     "itertools", "math", "typing", "types", "abc", "re", "json", "csv", "io", "gzip", "zlib", "hashlib", "struct", "importlib",
-    "array", "contextlib", "bisect", "operator", "string", "statistics", "decimal", "fractions", "numbers", "copy", "pkgutil", "ast", "inspect",
+    "contextlib", "bisect", "operator", "string", "statistics", "decimal", "fractions", "numbers", "copy", "pkgutil", "ast", "inspect",
+    "array",
 }  # fmt: skip
 LAZY = {"scipy", "filterpy", "pyarrow", "typst", "dask", "distributed", "dynamixel_sdk", "nidaqmx", "grpc", "cryptography"}
 SOURCES = sorted([*ROOT.glob("calib_core/**/*.py"), *ROOT.glob("server/**/*.py")])
