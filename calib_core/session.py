@@ -136,7 +136,8 @@ def axes_of(states: Mapping[str, Result]) -> dict[str, Result]:
 def states_of(recording: Recording) -> list[str]:
     """Which of the six states a recording holds, in their order."""
     found = set()
-    for name in recording.segment_names:
+    for code in np.unique(recording.segment_codes):
+        name = recording.segment_names[code]
         segment = parse_segment(name)
         found.add(segment.state if segment else name)
     return [state for state in STATES if state in found]
