@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from calib_core.problem import Problem
 
 SUBJECTS: dict[str, tuple[str, ...]] = {
-    "core": ("core", "parsing", "startup"),
+    "core": ("core", "parsing", "calibration", "startup"),
 }
 
 
