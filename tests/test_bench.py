@@ -5,7 +5,7 @@ import json
 import pytest
 
 from server import bench, cli
-from server.bench import Row, startup, table
+from server.bench import Row, boards, startup, table
 
 
 def test_a_figure_is_judged_on_its_own_side_of_the_limit() -> None:
@@ -44,3 +44,10 @@ def test_filters_reach_their_figures(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_start_up_is_measured_in_a_fresh_interpreter() -> None:
     assert startup._cpu("pass" + startup.REPORT) < startup._cpu(startup.IMPORTS + startup.REPORT)
+
+
+def test_a_simulated_board_is_found_again_by_both_estimates() -> None:
+    for found in boards.board(3):
+        for scale_pct, bias_mV in found.values():
+            assert abs(scale_pct) < 0.1
+            assert abs(bias_mV) < 0.1
