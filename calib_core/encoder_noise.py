@@ -18,6 +18,8 @@ REST_S = 0.4
 """The same code for at least this long is a rest."""
 SETTLING_S = 0.1
 """Cut from both ends of a rest: the table may still creep within the code."""
+FINE = 30.0
+"""A grid so fine that neighbouring readings are this many codes apart is a printed number's last digit, or as good."""
 PATTERN = 16
 """Two readings see the same motion where this many codes before and after them are equal."""
 
@@ -60,7 +62,9 @@ def step_of(angle_deg: F64) -> float:
         codes = np.round((levels - levels[0]) / step)
         step = float(codes @ (levels - levels[0]) / (codes @ codes))
     off_grid = np.abs(levels - levels[0] - step * codes).max()
-    return step if off_grid < 0.1 * step else 0.0
+    jumps = np.abs(np.diff(angle_deg))
+    fine = np.median(jumps[jumps > 0.0]) > FINE * step
+    return 0.0 if fine or off_grid > 0.1 * step else step
 
 
 def inspect(time_s: F64, angle_deg: F64) -> Readings:

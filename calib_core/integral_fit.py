@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 SUFFIX = {"V": "V", "deg/s": "dps", "counts": "counts"}
 ROUNDS = 3
 """Rounds over the codes; a fourth moves S by less than a hundredth of its uncertainty."""
+SOFTEST = 0.5
+"""Readings noisier than this, in steps, blur the codes' edges: they are taken as Gaussian."""
 MOVED_STEPS = 20.0
 """An encoder that moved by fewer of its steps says nothing about the scale factor."""
 
@@ -140,18 +142,19 @@ class Design:
         start = RowNoise(first_guess(self.rows, y), reading_deg=self._reading_noise(y, values))
         noise = fit_noise(self.rows, y, self.columns(0.0, scale_factor), scale_factor, start)
         delay = 0.0
-        rounds = ROUNDS if self.readings is not None and self.readings.step_deg > 0.0 else 1
+        step = self.readings.step_deg if self.readings is not None else 0.0
+        rounds = ROUNDS if start.reading_deg < SOFTEST * step else 1
         sites = None
         for turn in range(rounds + 1):
             columns = design.columns(delay, scale_factor)
-            if turn:
-                noise = fit_noise(design.rows, y, columns, scale_factor, noise.noise)
+            if turn in (1, rounds):
+                noise = fit_noise(design.rows, y, columns, scale_factor, noise.base, noise)
             values, covariance = design.estimate(y, columns, noise.noise, values)
             if len(values) == 1:
                 break
             delay, values[2], scale_factor = delay + float(values[2]), 0.0, float(values[1])
             y = self.output(delay)
-            if turn < rounds and self.readings is not None and self.readings.step_deg > 0.0:
+            if turn < rounds and rounds > 1:
                 sites = design._sharpened(y, columns, values, noise.noise, sites)
                 design = self._at(sites)
                 noise = replace(noise, base=replace(noise.base, reading_deg=0.0))
@@ -192,7 +195,7 @@ class Design:
         pull = rows.to_readings(whitener.precision_times(whitener.whiten(y - columns @ values)))
         smooth = sites.level_deg - values[1] * sites.variance * pull
         ending, _ = rows.ends
-        density = noise.white**2 * rows.sample_s + 2.0 * noise.ar1**2 * noise.correlation_time_s
+        density = noise.white**2 * self.averages.samples.interval_s + 2.0 * noise.ar1**2 * noise.correlation_time_s
         step_variance = density * rows.dt_s[ending] / values[1] ** 2
         variance = path_variance(sites.variance, ending >= 0, step_variance)
         return sharpen(readings.angle_deg, readings.step_deg, smooth, variance, sites)

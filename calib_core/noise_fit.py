@@ -16,6 +16,8 @@ MAX_ROWS = 24_000
 BLOCK = 3_000
 AR1_EVIDENCE = 8.0
 """2ΔlnL that the two parameters of AR(1) noise must buy."""
+ENOUGH = 0.02
+"""A relative step in the noise that no longer matters."""
 MAX_CORRELATION_S = 5.0
 """φ = 0.998 at 100 Hz; slower than this is not noise but a wandering bias."""
 
@@ -42,10 +44,13 @@ class NoiseFit:
         return self.at(self.logarithms)
 
 
-def fit_noise(rows: Rows, y: F64, columns: F64, scale_factor: float, start: RowNoise) -> NoiseFit:
+def fit_noise(
+    rows: Rows, y: F64, columns: F64, scale_factor: float, start: RowNoise, near: NoiseFit | None = None
+) -> NoiseFit:
     """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p).
 
-    The error of readings is estimated too where ``start.reading_deg`` is not 0.
+    The error of the encoder's readings is estimated too where the rows bring no variance for it. ``near`` is a fit to
+    almost the same rows: the same kind of noise is fitted again, from there.
     """
     n = len(rows)
     if n > MAX_ROWS:
@@ -68,12 +73,13 @@ def fit_noise(rows: Rows, y: F64, columns: F64, scale_factor: float, start: RowN
     def fitted(fields: tuple[str, ...], values: list[float]) -> tuple[NoiseFit, float]:
         fit = NoiseFit(start, fields, np.log(values), np.empty((0, 0)))
         logarithms, deviance, curvature = _minimise(deviance_of(fit), fit.logarithms)
-        return replace(fit, logarithms=logarithms, covariance=2.0 * np.linalg.inv(curvature)), deviance
+        return replace(fit, logarithms=logarithms, covariance=_covariance(curvature)), deviance
 
-    fields = ("white", "reading_deg") if start.reading_deg > 0.0 else ("white",)
-    if start.ar1 > 0.0:
-        coloured = (*fields, "ar1", "correlation_time_s")
-        return fitted(coloured, [getattr(start, field) for field in coloured])[0]
+    if near is not None:
+        near = replace(near, base=start)
+        logarithms, _, curvature = _minimise(deviance_of(near), near.logarithms)
+        return replace(near, logarithms=logarithms, covariance=_covariance(curvature))
+    fields = ("white", "reading_deg") if start.reading_deg > 0.0 and not rows.reading_variance.any() else ("white",)
     plain, low = fitted(fields, [getattr(start, field) for field in fields])
     base = plain.noise
     trial = replace(plain, fields=("white", "ar1", "correlation_time_s"), base=base)
@@ -100,15 +106,17 @@ def first_guess(rows: Rows, y: F64) -> float:
     return max(float(np.std(np.diff(chosen, 3))) / math.sqrt(20.0), 1e-12)
 
 
+def _covariance(curvature: F64) -> F64:
+    return np.asarray(2.0 * np.linalg.inv(curvature))
+
+
 def _minimise(function: Callable[[F64], float], x: F64) -> tuple[F64, float, F64]:
     """Newton's method with differences and a limit on the step: minimum, value and Hessian there."""
     h, k = 0.05, len(x)
-    value = function(x)
+    unit, value = h * np.eye(k), function(x)
     for _ in range(25):
-        unit = h * np.eye(k)
         up = np.array([function(x + e) for e in unit])
         down = np.array([function(x - e) for e in unit])
-        gradient = (up - down) / (2.0 * h)
         hessian = np.diag((up - 2.0 * value + down) / h**2)
         for i in range(k):
             for j in range(i):
@@ -116,12 +124,12 @@ def _minimise(function: Callable[[F64], float], x: F64) -> tuple[F64, float, F64
                 hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + value) / h**2
         power, vectors = np.linalg.eigh(hessian)
         power = np.maximum(np.abs(power), 1e-3)
-        step = -vectors @ ((vectors.T @ gradient) / power)
+        step = -vectors @ ((vectors.T @ (up - down)) / (2.0 * h * power))
         step *= min(1.0, 1.5 / float(np.abs(step).max()))
         while (after := function(x + step)) > value and np.abs(step).max() > 1e-3:
             step /= 3.0
         if after <= value:
             x, value = x + step, after
-        if np.abs(step).max() < 0.02:
+        if np.abs(step).max() < ENOUGH:
             break
     return x, value, np.asarray((vectors * power) @ vectors.T)

@@ -19,6 +19,8 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+REGULAR = 0.01
+"""Relative variance added to each row's white noise, for what the trapezoid rule leaves out."""
 GAP = 2.5
 """A gap of more than this many sampling intervals interrupts the record."""
 
@@ -125,7 +127,7 @@ def with_reference(s: Samples, rate_dps: F64) -> tuple[Rows, Averages, F64]:
     n, none = len(at), np.full(len(at), -1)
     time = s.time_s[at]
     start = np.diff(time, prepend=-np.inf) > GAP * s.interval_s
-    rows = Rows(time, np.full(n, s.interval_s), start, none, none, np.empty(0), s.interval_s)
+    rows = Rows(time, np.full(n, s.interval_s), start, none, none, np.empty(0), np.ones(n), np.zeros(n))
     return rows, Averages(s, time, time, at), rate[at]
 
 
@@ -171,5 +173,39 @@ def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Average
     inside = stretch[np.clip(np.searchsorted(s.time_s, middle, side="right") - 1, 0, None)]
     start = np.diff(inside, prepend=-1) != 0
     kept = readings.take(new)
-    rows = Rows(middle, dt, start, before, after, kept.variance, s.interval_s)
+    own, next_ = _white(s, begin_s, end_s, at, start)
+    rows = Rows(middle, dt, start, before, after, kept.variance, own, next_)
     return rows, Averages(s, begin_s, end_s, at), kept
+
+
+def _white(s: Samples, begin_s: F64, end_s: F64, at: Ints, start: Mask) -> tuple[F64, F64]:
+    """Variance of each row's mean, and covariance with the next row's, for samples of white noise of variance 1.
+
+    By the trapezoid rule an integral up to a time between samples k and k+1, u of the way, holds all samples up to k,
+    less (1-u)²/2 of sample k, plus u²/2 of sample k+1.
+    """
+
+    def spread(begin_s: F64, end_s: F64) -> F64:
+        (a, u), (b, v) = ((np.floor(x), x % 1.0) for x in (_at(begin_s), _at(end_s)))
+        p, q, r, t = (1.0 - u) ** 2 / 2.0, u**2 / 2.0, (1.0 - v) ** 2 / 2.0, v**2 / 2.0
+        apart = b - a
+        out = apart + p**2 + q**2 + r**2 + t**2
+        out -= np.where(apart >= 1, 2.0 * (r + q), 2.0 * (p * r + q * t))
+        return np.asarray(out + np.where(apart == 1, 2.0 * r * q, 0.0))
+
+    def _at(time_s: F64) -> F64:
+        return np.interp(time_s, s.time_s, np.arange(float(len(s.time_s))))
+
+    own, next_ = np.ones(len(at)), np.zeros(len(at))
+    moving = at < 0
+    scale = s.interval_s / (end_s - begin_s)[moving]
+    own[moving] = spread(begin_s[moving], end_s[moving]) * scale**2
+    chained = np.flatnonzero(moving[:-1] & moving[1:] & ~start[1:])
+    a, b = chained, chained + 1
+    both = spread(begin_s[a], end_s[b])
+    scale = s.interval_s**2 / ((end_s - begin_s)[a] * (end_s - begin_s)[b])
+    apart = (own[a] * (end_s - begin_s)[a] ** 2 + own[b] * (end_s - begin_s)[b] ** 2) / s.interval_s**2
+    next_[a] = (both - apart) / 2.0 * scale
+    # With exact readings at the samples' own times the alternating part would vanish altogether.
+    own[moving] *= 1.0 + REGULAR
+    return own, next_

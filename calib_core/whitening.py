@@ -21,7 +21,7 @@ TAIL = 512
 
 @dataclass(frozen=True)
 class RowNoise:
-    """Gyro noise in the unit of the output: ``white`` is the deviation of one sample of length ``Rows.sample_s``."""
+    """Gyro noise in the unit of the output: ``white`` is the standard deviation of one sample."""
 
     white: float
     ar1: float = 0.0
@@ -45,7 +45,10 @@ class Rows:
     """(n,) which reading begins and ends the interval; -1 for a row without encoder."""
     reading_variance: F64
     """(m,) deg²; a reading that stands for a whole rest has one error."""
-    sample_s: float
+    white_own: F64
+    """(n,) variance of the row's mean if a sample's noise is white with variance 1."""
+    white_next: F64
+    """(n,) and its covariance with the next row: neighbours share the sample between them."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -63,7 +66,11 @@ class Rows:
         """The rows ``chosen`` (increasing); nothing is carried over where one was left out."""
         start = self.start[chosen] | (np.diff(chosen, prepend=-2) != 1)
         before, after = self.before[chosen], self.after[chosen]
-        return Rows(self.time_s[chosen], self.dt_s[chosen], start, before, after, self.reading_variance, self.sample_s)
+        white_next = np.where(np.append(start[1:], True), 0.0, self.white_next[chosen])
+        return Rows(
+            self.time_s[chosen], self.dt_s[chosen], start, before, after,
+            self.reading_variance, self.white_own[chosen], white_next,
+        )  # fmt: skip
 
     def to_readings(self, values: F64) -> F64:
         """(m,) how the readings' errors (deg) meet ``values`` (n,): the adjoint of errors -> rows, for S = 1."""
@@ -85,38 +92,36 @@ class Whitener:
 
         self._rows = rows
         n = len(rows)
-        white = noise.white**2 * rows.sample_s / rows.dt_s
-        phi = np.zeros(n + 1)
-        if noise.ar1 > 0.0:
-            phi[1:n] = np.exp(-np.diff(rows.time_s) / noise.correlation_time_s)
-            phi[:n][rows.start] = 0.0
-        self._phi = phi[:n]
-        band = np.zeros((3, n + 2))
-        band[0, :n] = white + noise.ar1**2 * (1.0 - phi[:n] ** 2)
-        band[0, 1:n] += phi[1:n] ** 2 * white[:-1]
-        band[1, : n - 1] = -phi[1:n] * white[:-1]
-
+        reading = scale_factor**2 * (rows.reading_variance + noise.reading_deg**2)
         ending, beginning = rows.ends
-        near = (ending < 0) | (beginning < 0) | (beginning == ending + 1)
-        sigma = abs(scale_factor) * np.sqrt(rows.reading_variance + noise.reading_deg**2)
-        inverse_dt = np.append(1.0 / rows.dt_s, 0.0)
-        for group in (near & (ending >= 0), near & (ending < 0) & (beginning >= 0)):
-            e, b, s = ending[group], beginning[group], sigma[group]
-            first = np.where(e >= 0, e, b)
-            c0 = np.where(e >= 0, -inverse_dt[e], inverse_dt[b]) * s
-            c1 = np.where(e >= 0, inverse_dt[b], 0.0) * s - phi[first + 1] * c0
-            c2 = -np.where((e >= 0) & (b >= 0), phi[np.minimum(first + 2, n)] * inverse_dt[b], 0.0) * s
-            for lag, left, right in ((0, (c0, c1, c2), (c0, c1, c2)), (1, (c0, c1), (c1, c2)), (2, (c0,), (c2,))):
-                for shift, (x, y) in enumerate(zip(left, right, strict=True)):
-                    band[lag, first + shift] += x * y  # each reading has its own first row
-        if noise.ar1 <= 0.0:
-            band = band[:2]  # without φ nothing reaches two rows
-        self._factor = cholesky_banded(band[:, :n], lower=True, check_finite=False, overwrite_ab=True)
+        far = np.flatnonzero((ending >= 0) & (beginning > ending + 1))
+
+        # Covariance of y: each row has white noise and two readings' errors, of which it shares one with the next row.
+        one = np.append(reading, 0.0)  # index -1 finds the zero
+        one[far] = 0.0
+        shared = np.where(rows.after[:-1] == rows.before[1:], one[rows.after[:-1]], 0.0)
+        own = noise.white**2 * rows.white_own + (one[rows.before] + one[rows.after]) / rows.dt_s**2
+        next_ = noise.white**2 * rows.white_next
+        next_[:-1] -= shared / (rows.dt_s[:-1] * rows.dt_s[1:])
+
+        # Covariance of y_j - φ·y_{j-1}.
+        self._phi = phi = np.zeros(n)
+        if noise.ar1 > 0.0:
+            phi[1:] = np.exp(-np.diff(rows.time_s) / noise.correlation_time_s)
+            phi[rows.start] = 0.0
+            band = np.zeros((3, n))
+            band[0] = own + noise.ar1**2 * (1.0 - phi**2)
+            band[0, 1:] += phi[1:] * (phi[1:] * own[:-1] - 2.0 * next_[:-1])
+            band[1, :-1] = next_[:-1] - phi[1:] * own[:-1]
+            band[1, 1:-1] += phi[2:] * phi[1:-1] * next_[:-2]
+            band[2, :-2] = -phi[2:] * next_[:-2]
+        else:
+            band = np.stack([own, next_])
+        self._factor = cholesky_banded(band, lower=True, check_finite=False, overwrite_ab=True)
         self.log_determinant = 2.0 * float(np.log(self._factor[0]).sum())
         self._far: list[tuple[slice, F64]] = []
-        far = np.flatnonzero(~near)
         if len(far):
-            self._add_rests(ending[far], beginning[far], sigma[far])
+            self._add_rests(ending[far], beginning[far], np.sqrt(reading[far]))
 
     def _add_rests(self, entry: Ints, leave: Ints, sigma: F64) -> None:
         """Σ += Σ_k u_k·u_kᵀ: u_k is the error of rest k, seen in its entry row and, reversed, in its exit row.
