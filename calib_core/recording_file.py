@@ -50,6 +50,7 @@ def read_any(data: bytes | BinaryIO, *, mapping: Mapping[str, str], max_bytes: i
     check_names(names, table.line - 1)
     recording = _fast(table, names) or _slow(table, names)
     try:
+        _refuse_cut_off(table, recording)
         return check(recording)
     except Problem as problem:
         if "line" not in problem.values:
@@ -232,6 +233,15 @@ def _slow(table: TextTable, names: Sequence[str]) -> Recording:
 def with_left_out(header: Mapping[str, str], names: Sequence[str]) -> Mapping[str, str]:
     """The header with a line that names the columns left out, if there are any."""
     return {**header, "left_out": listed(names)} if names else header
+
+
+def _refuse_cut_off(table: TextTable, recording: Recording) -> None:
+    """A last row without its line's end, whose segment is the beginning of the one before, is half a row."""
+    if table.raw.endswith((b"\n", b"\r")) or len(recording) < 2:
+        return
+    before, last = (recording.segment_names[code] for code in recording.segment_codes[-2:])
+    if last != before and before.startswith(last):
+        raise Problem("recording.cut_off", line=len(recording), column="segment")
 
 
 def number(cell: str) -> float | None:

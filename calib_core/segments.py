@@ -4,7 +4,8 @@ import re
 from dataclasses import dataclass
 
 _READING = re.compile(
-    r"(?P<kind>rate|position)_(?P<axis>[xyz])/(?P<test>linearity|repeat)/(?P<set_point>[+-]?\d+(?:\.\d+)?)/(?P<reading>\d+)"
+    r"(?P<kind>rate|position)_(?P<axis>[xyz])/(?P<test>linearity|repeat)/(?P<set_point>[+-]?\d+(?:\.\d+)?)/(?P<reading>\d+)",
+    re.ASCII,
 )
 
 

@@ -58,6 +58,8 @@ BAD: dict[str, tuple[Change, str, int | None, str | None]] = {
     "gzip without its end": (zipped(cut=-4), "recording.gzip_truncated", None, None),
     "damaged gzip": (zipped(damage=True), "recording.gzip_corrupt", None, None),
     "cut off in a row": (lambda lines: csv_bytes(lines)[:-12], "recording.cells", 212, None),
+    "cut off in a segment": (lambda lines: csv_bytes(lines)[:-3], "recording.cut_off", 212, "segment"),
+    "cut off before a segment": (lambda lines: csv_bytes(lines)[:-5], "recording.cut_off", 212, "segment"),
     "a cell too many": (line(50, "0.47,1.2,0,hold,7"), "recording.cells", 50, None),
     "a quotation mark that is never closed": (line(50, '0.47,1.2,0,"hold'), "recording.control_character", 50,
                                               "segment"),
@@ -131,6 +133,7 @@ def test_the_good_file_that_the_bad_ones_are_made_of_is_good() -> None:
     recording = read(csv_bytes(csv_lines()))
     assert len(recording) == 210
     assert recording.columns["x_position_deg"][4] == 0.2933
+    assert read(csv_bytes(csv_lines()).rstrip()).digest() == recording.digest()
 
 
 def test_a_file_over_the_limit_is_refused_unread() -> None:

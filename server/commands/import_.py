@@ -38,8 +38,12 @@ def main(args: argparse.Namespace) -> int:
     if args.out:
         form_of(Path(args.out))
     for file in map(Path, args.files):
-        with file.open("rb") as opened:
-            recording = read(opened, name=file.name, mapping=mapping)
+        try:
+            with file.open("rb") as opened:
+                recording = read(opened, name=file.name, mapping=mapping)
+        except Problem as problem:
+            reason = {"code": problem.code, "values": problem.values}
+            raise Problem("import.refused", file=str(file), reason=reason) from None
         recording = replace(recording, header={**recording.header, **header})
         board = recording.header.get("board") or "unknown"
         if args.out:
