@@ -3,6 +3,7 @@
 One arithmetic for both tests and for the thesis' own readings; only units and full scale differ.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,6 +23,7 @@ CI = 0.25
 FEWEST_TO_DROP = 5
 """From this many readings on the smallest and the largest are dropped; below it too little would be left."""
 SUFFIX = {"rate": "dps", "position": "deg"}
+UNIT = {"rate": "deg/s", "position": "deg"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +36,6 @@ class Line:
     slope_se: float
     intercept_se: float
     residual_sd: float
-
-    def at(self, x: F64) -> F64:
-        return self.slope * x + self.intercept
 
 
 def line(x: F64, y: F64) -> Line:
@@ -142,7 +141,7 @@ class Repeatability:
     @property
     def type_a(self) -> float:
         """(2.21) of the worst set-point: S_max / sqrt(n), a standard uncertainty."""
-        return self.max_standard_deviation / self.worst.n**0.5
+        return self.max_standard_deviation / math.sqrt(self.worst.n)
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,8 @@ class SampleSize:
     @property
     def needed(self) -> float:
         """(5.5) N = (t S / d)^2, not rounded up."""
-        return float((self.t * self.standard_deviation / self.d) ** 2)
+        ratio = self.t * self.standard_deviation / self.d
+        return ratio * ratio
 
     @property
     def enough(self) -> bool:
@@ -291,7 +291,7 @@ def evaluate(
     straight = set_points(points, "linearity", drop_extremes=False)
     repeats = set_points(points, "repeat", drop_extremes=True)
     for test, present in (("linearity", straight), ("repeat", repeats)):
-        told += _missing(test, present, (expected or {}).get(test, ()), SUFFIX[kind])
+        told += _missing(test, present, (expected or {}).get(test, ()), UNIT[kind])
     repeats = tuple(point for point in repeats if point.n > 1)
     result = TestResult(
         kind,
@@ -303,19 +303,25 @@ def evaluate(
         told,
     )
     if (size := result.sample_size) and not size.enough:
-        told.append({"code": "test.too_few_repeats", "values": size.to_json()["values"] | {"unit": SUFFIX[kind]}})
+        told.append({"code": "test.too_few_repeats", "values": size.to_json()["values"] | {"unit": UNIT[kind]}})
     return result
+
+
+def word(test: str) -> Warning_:
+    """The name of a test inside a sentence, said in the reader's language."""
+    return {"code": f"test_name.{test}", "values": {}}
 
 
 def _missing(test: str, present: tuple[SetPoint, ...], expected: Sequence[float], unit: str) -> list[Warning_]:
     there = {round(point.set_point, 6) for point in present}  # what a segment's name resolves
     absent = [at for at in expected if round(at, 6) not in there]
+    named = {"test": word(test), "unit": unit}
     told = []
     if absent:
-        told.append({"code": "test.set_points_missing", "values": {"test": test, "unit": unit, "set_points": absent}})
+        told.append({"code": "test.set_points_missing", "values": {**named, "set_points": absent}})
     most = max([len(point.readings) for point in present] + [2 if test == "repeat" else 1])
     for point in present:
         if len(point.readings) < most:
-            values = {"test": test, "unit": unit, "set_point": point.set_point, "got": len(point.readings), "of": most}
+            values = {**named, "set_point": point.set_point, "got": len(point.readings), "of": most}
             told.append({"code": "test.readings_missing", "values": values})
     return told

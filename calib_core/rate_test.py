@@ -102,7 +102,7 @@ def readings(recording: Recording, axis: str, bias: float, scale_factor: float, 
         u = np.full(len(strokes), strokes.step_deg / 12**0.5 * 2**0.5 / THESIS_SPAN_S)
     else:
         measured, _, _ = strokes.slope(integral_at(gyro_time, rate, strokes.time_s), weight)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             u = strokes.step_deg / 12**0.5 / np.sqrt(spread)
     taken = [strokes.segments[i] for i in kept]
     return Readings(

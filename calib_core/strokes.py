@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from calib_core.kalman import filter_record, noise_density, tuning
+from calib_core.kalman import filter_record, tuning
+from calib_core.linearity import word
 from calib_core.recording import Recording, Segment, parse_segment
 
 F64 = npt.NDArray[np.float64]
@@ -75,8 +76,8 @@ class Strokes:
 
     def warning(self, code: str, i: int, **values: object) -> dict[str, Any]:
         segment = self.segments[i]
-        named = {"test": segment.test, "set_point": segment.set_point, "reading": segment.reading, "axis": segment.axis}
-        return {"code": code, "values": named | values}
+        place = {"axis": segment.axis, "set_point": segment.set_point, "reading": segment.reading}
+        return {"code": code, "values": {"test": word(segment.test), **place, **values}}
 
 
 def find(recording: Recording, kind: str, axis: str) -> tuple[Strokes, list[dict[str, Any]]]:
@@ -163,6 +164,8 @@ def integral_at(time_s: F64, rate: F64, at_s: F64) -> F64:
 
 
 def filtered(time_s: F64, rate: F64) -> F64:
-    """(n,) the thesis' Kalman filter over a compensated rate (n,): filtering and compensating commute (3.23)."""
-    dt = float(np.median(np.diff(time_s)))
-    return filter_record(rate, dt, tuning(noise_density(rate, dt)))
+    """(n,) the thesis' Kalman filter over a compensated rate (n,): filtering and compensating commute (3.23).
+
+    Its gain depends on the ratio of the densities only, which is the tuning's; so any density of the noise will do.
+    """
+    return filter_record(rate, float(np.median(np.diff(time_s))), tuning(1.0))
