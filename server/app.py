@@ -19,7 +19,6 @@ from server.auth import Guard
 from server.settings import Settings
 from server.texts import WEB
 
-JSON_LIMIT = 1 << 20
 POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 
 
@@ -65,7 +64,6 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
-        max_body_size=JSON_LIMIT,
     )
     app.state.services = services
     problems.install(app)

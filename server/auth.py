@@ -1,16 +1,20 @@
-"""Who may write: a one-time token where the server is reachable from outside, and no foreign page anywhere."""
+"""Who may write, and how much: a token where others can reach the server, no foreign page anywhere, bodies of a size."""
 
 import secrets
 from urllib.parse import urlsplit
 
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from calib_core.problem import Problem
+from calib_core.recording import MAX_BYTES
 from server import problems
 
 READS = {"GET", "HEAD", "OPTIONS"}
 ALWAYS_ALLOWED = "/api/v1/rig/stop"  # the emergency stop is never locked
+LARGEST = {"/api/v1/recordings": MAX_BYTES + (1 << 16)}
+LARGEST_ELSEWHERE = 1 << 20
 
 
 def new_token() -> str:
@@ -24,14 +28,31 @@ class Guard:
         self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
-            request = Request(scope)
-            try:
-                check_write(request, self._token)
-            except Problem as problem:
-                await problems.answer(request, problem)(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        largest = LARGEST.get(request.url.path, LARGEST_ELSEWHERE)
+        try:
+            check_write(request, self._token)
+            declared = request.headers.get("content-length", "0")
+            if declared.isdigit() and int(declared) > largest:
+                raise Problem("request.too_large")
+        except Problem as problem:
+            await problems.answer(request, problem)(scope, receive, send)
+            return
+        read = 0
+
+        async def counted() -> Message:
+            # A body need not say its length first.
+            nonlocal read
+            message = await receive()
+            read += len(message.get("body", b""))
+            if read > largest:
+                raise HTTPException(413)
+            return message
+
+        await self._app(scope, counted, send)
 
 
 def check_write(request: Request, token: str | None) -> None:

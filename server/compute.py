@@ -7,12 +7,13 @@ import asyncio
 import multiprocessing
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from calib_core.problem import Problem
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 T = TypeVar("T")
 
@@ -25,6 +26,9 @@ class Compute:
         self._once: dict[str, Any] = {}
 
     async def run(self, work: Callable[..., T], *arguments: object) -> T:
+        from concurrent.futures import ProcessPoolExecutor
+        from concurrent.futures.process import BrokenProcessPool
+
         for attempt in (1, 2):
             if self._pool is None:
                 context = multiprocessing.get_context("spawn")
@@ -48,7 +52,7 @@ class Compute:
 
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool.shutdown(cancel_futures=True)
             self._pool = None
 
 

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from calib_core.problem import Problem
 from server import texts
+from server.devices import DeviceError
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -55,12 +56,14 @@ FIELD_TEXTS = {
 TYPE_TEXTS = {"int": "not_whole", "float": "not_number", "bool": "not_boolean", "string": "not_text"}
 
 
-def status_of(code: str) -> int:
-    return 404 if code.endswith(".not_found") else STATUS.get(code, 422)
+def status_of(problem: Problem) -> int:
+    if problem.code.endswith(".not_found"):
+        return 404
+    return STATUS.get(problem.code, 502 if isinstance(problem, DeviceError) else 422)
 
 
 def document(problem: Problem, lang: str, instance: str, status: int | None = None) -> dict[str, Any]:
-    status = status or status_of(problem.code)
+    status = status or status_of(problem)
     return {
         "type": f"urn:gyrobench:problem:{problem.code}",
         "title": HTTPStatus(status).phrase,

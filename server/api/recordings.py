@@ -10,7 +10,6 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from calib_core.problem import Problem
-from calib_core.recording import MAX_BYTES
 from server import compute
 from server.api import models
 from server.api.common import Cursor, Here, Limit, Search, Services
@@ -38,7 +37,6 @@ def recordings(
     status_code=201,
     summary="Keep a recording: gyro-recording 1 as CSV, .csv.gz or Parquet",
     responses=declared(400, 413),
-    max_body_size=MAX_BYTES + (1 << 16),
 )
 async def upload(
     here: Here,

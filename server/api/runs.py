@@ -5,8 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
-from calib_core.sequence import Axis
-from server import compute, run_plan, texts
+from server import compute, texts
 from server.api import models
 from server.api.common import Cursor, Here, Language, Limit, Search, Services
 from server.api.rig import LeaseToken
@@ -50,6 +49,10 @@ def _seconds(start: str | None, end: str | None) -> float | None:
 
 
 def _planned(here: Services, body: models.RunBody) -> tuple[dict[str, Any], Any]:
+    # With the first plan, not with the program: the arithmetic behind it is a tenth of start-up.
+    from calib_core.sequence import Axis
+    from server import run_plan
+
     axes = {name: Axis(**facts) for name, facts in (here.supervisor.rig or {}).get("axes", {}).items()}
     return run_plan.plan_of(here.store, body.model_dump(exclude_none=True), axes)
 
@@ -63,13 +66,15 @@ def plan(body: models.RunBody, here: Here) -> models.PlanAnswer:
 
 @router.post("", status_code=201, summary="Start a run", responses=declared(404, 409, 503))
 def start(body: models.RunBody, here: Here, lang: Language, lease: LeaseToken = None) -> models.Run:
+    from server.run_plan import create
+
     here.lease.check(lease)
     bench = here.supervisor
     with bench.claim():
         bench.check_free()
         speed = bench.speed if body.speed is None else checked_speed(body.speed, bench.url)
         filled, made = _planned(here, body)
-        run = run_plan.create(here.store, filled, made, rig=bench.url, speed=speed)
+        run = create(here.store, filled, made, rig=bench.url, speed=speed)
         row = here.store.runs.get(run)
         bench.begin(run, speed, {"status": "queued", "states": row["states"], "results": row["results"]})
     return shown(row, lang)
