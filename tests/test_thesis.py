@@ -151,7 +151,7 @@ def test_the_command_sets_the_tables_side_by_side(capsys: pytest.CaptureFixture[
     said = capsys.readouterr().out
     assert "0.7634 ≠ 2.1692" in said
     assert "215" in said.splitlines()[-2]
-    pairs = re.findall(r"(\S+) ([=≠]) (\S+)", said)
+    pairs = re.findall(r"(-?[\d.]+) ([=≠]) (-?[\d.]+)", said)
     assert len(pairs) > 700
     assert all((left == right) == (mark == "=") for left, mark, right in pairs)
 
