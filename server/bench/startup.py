@@ -46,7 +46,8 @@ def _serving(data: Path) -> float:
     command = [sys.executable, "-m", "server.cli", "serve", "--port", "0", "--data", str(data)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
-        server.stdout.readline()
+        if not server.stdout.readline():
+            raise RuntimeError(f"{' '.join(command)} ended before it answered")
         stat = Path(f"/proc/{server.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
         server.terminate()
     return (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
