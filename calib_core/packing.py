@@ -37,7 +37,8 @@ def pack(values: F64, resolution: float) -> bytes:
     real = values[there] if mask else values
     scale = 1.0 / resolution
     scale = float(round(scale)) if abs(scale - round(scale)) < 1e-6 * scale else scale
-    steps = np.rint(real * scale)
+    with np.errstate(over="ignore"):  # infinite steps are off every grid
+        steps = np.rint(real * scale)
     if not len(real) or np.abs(steps).max() >= 2**53 or not np.array_equal(steps / scale, real):
         return _COLUMN.pack(0, len(values), len(mask), scale, 0) + mask + _squeeze(_planes(real.astype("<f8")))
     whole = steps.astype(np.int64)

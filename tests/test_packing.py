@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recordings import csv_bytes, csv_lines
 
@@ -14,6 +14,7 @@ NUMBERS = st.one_of(st.floats(allow_infinity=True, allow_nan=True), st.integers(
 
 
 @settings(max_examples=200, deadline=None)
+@example([1.7e308, float("inf"), -0.5], 1e-6)
 @given(st.lists(NUMBERS, max_size=60), st.sampled_from([1e-6, 1e-4, 1e-3, 1.0, 0.25, 0.3]))
 def test_packing_loses_nothing(values: list[float], resolution: float) -> None:
     array = np.array(values, float)
