@@ -1,4 +1,4 @@
-"""Who may write, and how much: a token where others can reach the server, no foreign page anywhere, bodies of a size."""
+"""Who may write, and how much: a token where others can reach the server, no foreign page, bodies of a size."""
 
 import secrets
 from urllib.parse import urlsplit

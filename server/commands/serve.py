@@ -3,6 +3,7 @@
 import argparse
 import gc
 import socket
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -58,9 +59,16 @@ def listen(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise Problem("serve.port_out_of_range", port=port)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # asyncio sends small packets at once only where the protocol is named; unnamed, each answer waits 40 ms.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        return socket.create_server((host, port), family=family, backlog=256)
+        if sys.platform != "win32":  # there it would let two servers share the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(256)
+        return listener
     except OSError as error:
+        listener.close()
         code = "serve.port_in_use" if error.errno in _IN_USE else "serve.cannot_listen"
         raise Problem(code, host=host, port=port, next=port + 1, reason=error.strerror or str(error)) from error
 
