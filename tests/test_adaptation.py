@@ -47,7 +47,7 @@ def test_matched_estimate_is_within_half_a_percent_and_a_millivolt(frequency_hz:
 
 
 # Error of the scale factor in %, METHOD 1. Where only the gyro is filtered the two differ by 0.3 and 0.5: this filter
-# raises 0.25 Hz by 2.2 % (after the update; 2.6 % before it), METHOD's by 2.7 to 2.9 %, and its discrete form is not told.
+# raises 0.25 Hz by 2.2 % (2.6 % before the update), METHOD's by 2.7 to 2.9 %, and its discrete form is not told.
 @pytest.mark.parametrize(
     ("span_s", "filters", "printed_pct", "tolerance"),
     [
