@@ -8,13 +8,14 @@ readings stamped by the host's clock and by the DAQ's.
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.model import Model, Noise, Truth
 from calib_core.twin_daq import Daq, DaqSpec
-from calib_core.twin_servo import RX28, RX64, Servo, to_code, to_deg
+from calib_core.twin_servo import RX28, RX64, Servo, ServoSpec, to_code, to_deg
 
 F64 = NDArray[np.float64]
 
@@ -49,8 +50,10 @@ class Samples:
 class Plant:
     """Table, gyro and DAQ.
 
-    `models` is the gyro's truth by axis (default: `board_truth(seed)`). `tilt`: the sensor's z sees a turn of the
-    table's z times cos θ_x. `covariates`: a third and fourth channel, an LM35 (10 mV/°C) and half of the supply.
+    `models` is the gyro's truth by axis (default: `board_truth(seed)`); `servos` and `daq` are the parts as built
+    (default: servos half a per cent off in speed, a DAQ clock within 50 ppm, drawn from the seed). `tilt`: the sensor's
+    z sees a turn of the table's z times cos θ_x. `covariates`: a third and fourth channel, an LM35 (10 mV/°C) and half
+    of the supply.
     """
 
     def __init__(
@@ -58,20 +61,20 @@ class Plant:
         seed: int,
         models: Mapping[str, Model] | None = None,
         *,
+        servos: Mapping[str, ServoSpec] | None = None,
+        daq: DaqSpec | None = None,
+        start_deg: Mapping[str, float] = MappingProxyType({"x": -3.0, "z": 8.0}),
         tilt: bool = True,
         covariates: bool = False,
-        start_deg: Mapping[str, float] | None = None,
     ) -> None:
-        servo, daq, poll, self._noise = np.random.default_rng([seed, 2]).spawn(4)
-        where = start_deg or {"x": -3.0, "z": 8.0}
-        self.servos = {
-            axis: Servo(replace(spec, speed_error=servo.normal(0.0, 0.005)), servo, where[axis])
-            for axis, spec in (("x", RX28), ("z", RX64))
-        }
-        self.daq = Daq(DaqSpec(clock_error=daq.uniform(-5e-5, 5e-5)), daq)
+        servo_rng, daq_rng, self._poll, self._noise = np.random.default_rng([seed, 2]).spawn(4)
+        if servos is None:
+            parts = {"x": RX28, "z": RX64}
+            servos = {a: replace(part, speed_error=servo_rng.normal(0.0, 0.005)) for a, part in parts.items()}
+        self.servos = {axis: Servo(spec, servo_rng, start_deg[axis]) for axis, spec in servos.items()}
+        self.daq = Daq(daq or DaqSpec(clock_error=daq_rng.uniform(-5e-5, 5e-5)), daq_rng)
         self.tilt, self.covariates = tilt, covariates
         self.now_s = 0.0
-        self._poll = poll
         self._polls = 0
         self.mount(models or board_truth(seed))
 

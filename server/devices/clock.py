@@ -1,20 +1,23 @@
 """How the host's clock and the DAQ's belong together, from when samples arrived.
 
 A sample can only arrive late. So over (DAQ time, host time of arrival − DAQ time) the true relation is a line on or
-below every point, and the best line is the edge of their lower convex hull that spans the middle of the window (the
-classical one-way estimate of clock skew; Moon, Skelly and Towsley, 1999). What is left is the least transfer time,
-which no one-way measurement can show: about 1 to 2 ms on USB, constant, and a free parameter of the integral fit.
+below every point. Its slope, the skew, is that of the edge of their lower convex hull that spans the middle of a long
+window (the classical one-way estimate; Moon, Skelly and Towsley, 1999); its height is that of the promptest arrival
+of the last half minute, because crystals wander. What is left is the least transfer time, which no one-way measurement
+can show: about 1 to 2 ms on USB, constant, and a free parameter of the integral fit.
 """
 
 from bisect import bisect_right
 from collections import deque
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
-WINDOW_S = 120.0
+SKEW_S = 300.0
+OFFSET_S = 30.0
 BIN_S = 0.5  # within a bin only the promptest arrival is kept
 
 
@@ -38,7 +41,7 @@ class ClockRelation:
                 return
             self._points.pop()
         self._points.append((daq_time_s, lateness))
-        while self._points[0][0] < daq_time_s - WINDOW_S:
+        while self._points[0][0] < daq_time_s - SKEW_S:
             self._points.popleft()
         self._fit()
 
@@ -58,7 +61,9 @@ class ClockRelation:
         (t0, d0), (t1, d1) = hull[i - 1], hull[i]
         # Two crystals differ by some 1e-4 at most: a steeper edge is a late arrival in a short window.
         self._skew = float(np.clip((d1 - d0) / (t1 - t0), -2e-4, 2e-4)) if t1 > t0 else 0.0
-        self._offset_s = min(d - self._skew * t for t, d in hull)
+        now = self._points[-1][0]
+        recent = takewhile(lambda point: point[0] >= now - OFFSET_S, reversed(self._points))
+        self._offset_s = min(late - self._skew * time for time, late in recent)
 
 
 def _turns_down(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
