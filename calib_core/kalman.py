@@ -74,7 +74,7 @@ class _Twin:
     respond: F64  # (BLOCK, BLOCK): filtered block from measured block, starting at rest
     carry: F64  # (BLOCK, 2): its last state
     recall: F64  # (2, BLOCK): filtered block from the state before it
-    powers: F64  # (BLOCK + 1, 2, 2): state after i unmeasured steps
+    powers: F64  # (BLOCK + 1, 2, 2): what is left of a state i samples later
 
 
 @lru_cache(maxsize=32)
