@@ -2,6 +2,7 @@
 
 import json
 import sys
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -100,11 +101,18 @@ def _lines(outcome: Outcome, lang: str) -> list[str]:
             )
             written = (field.written(figures) for figures in axes.values())
             rows.append((kind + render(field.text, {}, lang), field.unit, *written))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     verdict = render(f"outcome.{outcome['verdict']}", {}, lang)
     lines = [render("outcome.board", {**outcome, "verdict": verdict}, lang), ""]
     for label, unit, *values in rows:
-        right = "  ".join(f"{value:>{width}}" for value, width in zip(values, widths[2:], strict=True))
-        lines.append(f"  {label:<{widths[0]}}  {right}  {unit}".rstrip())
+        right = "  ".join(
+            " " * (width - _width(value)) + value for value, width in zip(values, widths[2:], strict=True)
+        )
+        lines.append(f"  {label}{' ' * (widths[0] - _width(label))}  {right}  {unit}".rstrip())
     lines += [f"  ! {warning['sentence']}" for warning in outcome["warnings"]]
     return [*lines, "", *(f"  {path}" for path in outcome["documents"].values())]
+
+
+def _width(text: str) -> int:
+    """Columns on a terminal: Thai vowels and tone marks stand above or below their letter."""
+    return sum(unicodedata.category(letter) != "Mn" for letter in text)

@@ -68,7 +68,9 @@ def test_every_word_on_the_certificate_has_a_text_in_both_languages(content: dic
 
 
 def test_the_thai_certificate_is_set_in_thai(content: dict[str, Any]) -> None:
-    said = text_of(documents.render(content, "pdf", "th"))
+    pdf = documents.render(content, "pdf", "th")
+    assert len(PdfReader(io.BytesIO(pdf)).pages) == 2
+    said = text_of(pdf)
     assert "ไบแอส สเกลแฟกเตอร์" in said  # words without marks above: pypdf does not put those back in order
     assert "แกน x" in said
 

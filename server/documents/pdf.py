@@ -20,6 +20,7 @@ TEMPLATE = Path(__file__).with_name("certificate.typ")
 BY_PATH = {field.path: field for field in FIELDS}
 LONGEST_WORD = 28
 MINUS = "−"
+NO_TEST: Mapping[str, Any] = {"points": {"repeat": []}}
 
 
 def render_pdf(content: Mapping[str, Any], lang: str) -> bytes:
@@ -58,6 +59,7 @@ def page(content: Mapping[str, Any], lang: str) -> dict[str, Any]:
         "axes": [say("axis", axis=axis) for axis in axes],
         "estimate": {"title": say("estimate"), "rows": list(_estimate(content, lang))},
         "tests": {"title": say("tests"), **_tests(content, lang)},
+        "repeats": list(_repeats(content, lang)),
         "plots": [plot for name, state in content["states"].items() if (plot := _plot(name, state, lang))],
         "statements": [{"title": say(f"{name}.title"), "text": text} for name, text in _statements(content, lang)],
         "spec": {
@@ -131,24 +133,22 @@ def _verdict(content: Mapping[str, Any], lang: str) -> str:
 def _estimate(content: Mapping[str, Any], lang: str) -> Iterator[dict[str, Any]]:
     """Bias and scale factor large, with what stands beside them; then delay and step check where measured."""
     axes = content["axes"]
+
+    def row(key: str, field: Field, values: Sequence[str] | None = None, style: str = "") -> dict[str, Any]:
+        written = values or [signed(field.written(axis)) for axis in axes.values()]
+        return {"label": render(key, {}, lang), "unit": field.unit, "values": written, "style": style}
+
     for name in ("bias_V", "scale_factor_V_per_dps"):
         field = BY_PATH[(name,)]
-        yield _row(field, axes, lang, strong=True)
-        expanded = [_expanded(field, axis) for axis in axes.values()]
-        yield {"label": render("certificate.expanded", {}, lang), "unit": field.unit, "values": expanded, "minor": True}
-        yield _row(BY_PATH[("adaptive", name)], axes, lang, minor=True) | {
-            "label": render("certificate.adaptive", {}, lang)
-        }
-        sheet = [_datasheet(field, content["gyro_model"]["axes"].get(axis), axes[axis]) for axis in axes]
-        yield {"label": render("certificate.datasheet", {}, lang), "unit": field.unit, "values": sheet, "minor": True}
+        yield row(field.text, field, style="strong")
+        yield row("certificate.expanded", field, [_expanded(field, axis) for axis in axes.values()], "minor")
+        yield row("certificate.adaptive", BY_PATH[("adaptive", name)], style="minor")
+        sheets = content["gyro_model"]["axes"]
+        promised = [_datasheet(field, sheets.get(axis), figures) for axis, figures in axes.items()]
+        yield row("certificate.datasheet", field, promised, "minor")
     for path in (("delay_s",), ("step_check", "rate_error_pct"), ("step_check", "position_error_pct")):
         if any(BY_PATH[path].of(axis) is not None for axis in axes.values()):
-            yield _row(BY_PATH[path], axes, lang)
-
-
-def _row(field: Field, axes: Mapping[str, Any], lang: str, **style: bool) -> dict[str, Any]:
-    values = [signed(field.written(axis)) for axis in axes.values()]
-    return {"label": render(field.text, {}, lang), "unit": field.unit, "values": values, **style}
+            yield row(BY_PATH[path].text, BY_PATH[path])
 
 
 def _expanded(field: Field, axis: Mapping[str, Any]) -> str:
@@ -184,11 +184,39 @@ def _tests(content: Mapping[str, Any], lang: str) -> dict[str, Any]:
     }
 
 
+def _repeats(content: Mapping[str, Any], lang: str) -> Iterator[dict[str, Any]]:
+    """Bias error and random error at each set-point of the repeat tests (thesis 5.7-5.10, 5.15-5.18)."""
+    for kind, unit in (("rate", "deg/s"), ("position", "deg")):
+        of_axis = [
+            {
+                point["set_point"]: point
+                for point in content["states"].get(f"{kind}_{axis}", NO_TEST)["points"]["repeat"]
+            }
+            for axis in content["axes"]
+        ]
+        set_points = sorted({at for points in of_axis for at in points})
+        if set_points:
+            yield {
+                "title": render(f"certificate.repeats.{kind}", {}, lang),
+                "set_point": render("certificate.repeats.set_point", {"unit": unit}, lang),
+                "bias_error": render("certificate.repeats.bias_error", {}, lang),
+                "random_error": "2·S",
+                "rows": [[signed(f"{at:g}"), *_errors(at, of_axis)] for at in set_points],
+            }
+
+
+def _errors(set_point: float, of_axis: Sequence[Mapping[float, Mapping[str, Any]]]) -> Iterator[str]:
+    for points in of_axis:
+        for name in ("bias_error", "random_error"):
+            value = points.get(set_point, {}).get(name)
+            yield "–" if value is None else signed(f"{value:.4f}")
+
+
 def _limits(content: Mapping[str, Any], lang: str) -> Iterator[list[str]]:
     for row in content["judgement"]:
         field = BY_PATH[tuple(name for name in row["path"] if name != "value")]
         low, high, value = (
-            None if row[key] is None else f"{row[key] * field.factor:.6g}" for key in ("min", "max", "value")
+            None if row[key] is None else f"{row[key] * field.factor:.5g}" for key in ("min", "max", "value")
         )
         bounds = [f"≥ {low}" if low else "", f"≤ {high}" if high else ""]
         outcome = render(f"certificate.limits.{'ok' if row['ok'] else 'not_ok'}", {}, lang)
@@ -255,14 +283,15 @@ def _statements(content: Mapping[str, Any], lang: str) -> Iterator[tuple[str, st
     def say(key: str, **values: object) -> str:
         return render(f"certificate.{key}", values, lang)
 
-    named: dict[str, str] = {}
     yield "method", " ".join([say(f"method.{content['profile']}"), say("method.tests")])
+    calibrated = content["rig"]["reference_calibration"]
+    reference = "calibrated" if calibrated else "uncalibrated"
+    yield "traceability", say(f"traceability.{reference}", reference=inert(calibrated))
     budgets = [rows for state in content["states"].values() for rows in state.get("budget", {}).values()]
+    named: dict[str, str] = {}
     for part, excluded in (("included", False), ("excluded", True)):
         names = dict.fromkeys(row["name"] for rows in budgets for row in rows if row.get("excluded", False) == excluded)
         named[part] = ", ".join(render(f"budget.{name}", {}, lang) for name in names) or "–"
     yield "uncertainty", " ".join([say("uncertainty.included", **named), say("uncertainty.excluded", **named)])
-    calibrated = content["rig"]["reference_calibration"]
-    reference = "calibrated" if calibrated else "uncalibrated"
-    yield "traceability", say(f"traceability.{reference}", reference=inert(calibrated))
-    yield "scope", " ".join([say("scope.items"), *([say("scope.rule")] if content["spec"] else [])])
+    rule = [say("scope.rule")] if content["spec"] else []
+    yield "scope", " ".join([say("scope.items"), *rule, say("scope.again")])
