@@ -64,6 +64,17 @@ export const api = {
     await call("DELETE", "/rig/lease");
     sessionStorage.removeItem(LEASE);
   },
+  /** A lease is short: renews it in its last minute, and forgets it where it is over or another's. */
+  async keepRig(lease) {
+    if (!api.holdsRig()) return;
+    if (lease && Date.parse(lease.expires_at) - Date.now() > 60_000) return;
+    try {
+      if (!lease) throw new Error("over");
+      await api.holdRig(lease.holder);
+    } catch {
+      sessionStorage.removeItem(LEASE);
+    }
+  },
   holdsRig: () => sessionStorage.getItem(LEASE) !== null,
 
   gyroModels: () => call("GET", `/gyro-models${query({ limit: 200 })}`),

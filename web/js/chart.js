@@ -4,7 +4,7 @@
 //   x, y      {label, unit, digits, zero, min, max}
 //   series    [{name, role: measured|model|residual, draw: line|dash|dots|points|stems, digits}]
 //   group     charts of one group share zoom and cursor
-// set([xs, ys…], {from, to, band, note})  band: half-width of a shaded strip around zero.
+// set([xs, ys…], {from, to, band})  band: half-width of a shaded strip around zero.
 
 import { fixed, t } from "./text.js";
 
@@ -101,11 +101,6 @@ function drawBack(plot, spec, state) {
     const top = plot.valToPos(state.band, "y", true);
     ctx.fillStyle = colour("band");
     ctx.fillRect(bbox.left, top, bbox.width, plot.valToPos(-state.band, "y", true) - top);
-    ctx.fillStyle = colour("residual");
-    ctx.font = FONT.replace("12px", `${12 * devicePixelRatio}px`);
-    ctx.textBaseline = "top";
-    ctx.textAlign = "left";
-    ctx.fillText(state.note ?? "", bbox.left + 4 * devicePixelRatio, top + 3 * devicePixelRatio);
   }
   if (spec.y.zero) {
     const zero = plot.valToPos(0, "y", true);
@@ -145,7 +140,7 @@ export function chart(place, spec) {
   waiting.textContent = spec.waiting ?? "";
   place.append(figure);
 
-  const state = { band: null, note: null, range: null, zoom: null };
+  const state = { band: null, range: null, zoom: null };
   const group = spec.group ?? Symbol("alone");
   if (!groups.has(group)) groups.set(group, new Set());
   // Pictures above each other share their time axis, so their names get the same room.
@@ -237,8 +232,8 @@ export function chart(place, spec) {
   });
 
   return {
-    set(data, { from, to, band = null, note = null } = {}) {
-      Object.assign(state, { band, note, range: from === undefined ? null : [from, to] });
+    set(data, { from, to, band = null } = {}) {
+      Object.assign(state, { band, range: from === undefined ? null : [from, to] });
       const isEmpty = data[0].length === 0;
       waiting.hidden = !isEmpty;
       if (!plot) {

@@ -28,9 +28,10 @@ export function table(head, rows, { label, compact = false, cards = false } = {}
         h("tr", {}, cell("th", first, { scope: "row" }), rest.map((content, i) => cell("td", content, { "data-label": names[i + 1] })))))));
 }
 
-export const facts = (pairs) =>
-  h("dl", { class: "facts" }, pairs.filter(([, value]) => value != null && value !== "").flatMap(
-    ([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+/** Names and values; what has no value is left out. `wide` sets them in columns. */
+export const facts = (pairs, wide = false) =>
+  h("dl", { class: wide ? "facts wide" : "facts" }, pairs.filter(([, value]) => value != null && value !== "").map(
+    ([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
 
 /** Puts the sentence of a problem near what caused it (and empties it again). */
 export function say(place, problem) {

@@ -36,8 +36,8 @@ export function testCharts(place, kind) {
       [row.reference, row.residual, null], ...row.readings.map((value) => [row.reference, null, value - row.fit]),
     ]));
     const band = twoSigma(rows);
-    residual.rename(t("chart.residual_name"), t("chart.residual"));
-    residual.set(columns(flat, 3), { band, note: band ? t("chart.band_2sigma", { value: band, unit: UNIT[kind] }) : null });
+    residual.rename(band ? t("chart.residual_band", { value: band, unit: UNIT[kind] }) : t("chart.residual_name"), t("chart.residual"));
+    residual.set(columns(flat, 3), { band });
   }
 
   function repeat(rows) {

@@ -26,7 +26,7 @@ export function rigCard(place, { full = false } = {}) {
   const check = h("button", { type: "button", id: "rig-check" }, t("rig.check"));
   const field = (id, control, key) => h("div", {}, h("label", { for: id }, t(key)), control);
   const [portField, urlField, speedField] = [field("rig-port", port, "rig.port"), field("rig-custom", url, "rig.address"), field("rig-speed", speed, "rig.speed")];
-  place.replaceChildren(h("div", { class: "pair" }, field("rig-url", choice, "rig.rig"), speedField), portField, urlField, parts, error, h("div", { class: "row" }, check));
+  place.replaceChildren(h("div", { class: "pair uneven" }, field("rig-url", choice, "rig.rig"), speedField), portField, urlField, parts, error, h("div", { class: "row" }, check));
 
   const OTHER = "other:";
   let rig = null;

@@ -48,7 +48,7 @@ export function rigSentence(rig) {
   return `${name} · ${rig.connected ? t("rig.connected") : t("rig.not_connected")} · ${holder}`;
 }
 
-export const speedWord = (speed) => (speed === "max" || speed === Infinity || speed === 0 ? t("rig.as_fast_as_possible") : `${speed}×`);
+export const speedWord = (speed) => (speed === "max" || speed === Infinity || speed === 0 ? t("rig.full_speed") : `${speed}×`);
 
 /** Starts a page: bar, texts, the page's own work; then the rig every five seconds, told to `rig-changed` listeners. */
 export async function page(name, work) {
@@ -88,6 +88,7 @@ export async function page(name, work) {
   async function lookAtRig() {
     try {
       const rig = await api.rig();
+      await api.keepRig(rig.lease);
       who.textContent = rigSentence(rig);
       notice("rig", null);
       document.dispatchEvent(new CustomEvent("rig-changed", { detail: rig }));
@@ -96,7 +97,7 @@ export async function page(name, work) {
     }
   }
   document.addEventListener("rig-asked", lookAtRig);
-  setInterval(() => { if (!document.hidden) lookAtRig(); }, RIG_EVERY_MS);
+  setInterval(() => { if (!document.hidden || api.holdsRig()) lookAtRig(); }, RIG_EVERY_MS);
   try {
     await Promise.all([work(main), lookAtRig()]);
   } catch (problem) {

@@ -7,11 +7,11 @@ import { watch } from "../live.js";
 import { livePlots } from "../plots.js";
 import { estimateSummary, resultCard, split, stateName } from "../results.js";
 import { Setup } from "../setup.js";
-import { notice, page } from "../shell.js";
+import { notice, page, speedWord } from "../shell.js";
 import { STATES, showStates } from "../states.js";
 import { duration, sentence, t } from "../text.js";
 
-const FRAME_MS = 48;   // 20 pictures a second, no more
+const FRAME_MS = 45;   // the screen's next picture after this: 20 a second, no more
 const PLAN_AFTER_MS = 300;
 
 let setup;
@@ -22,6 +22,8 @@ page("calibrate", async () => {
   setup = new Setup($("#setup"), { onStart: start, onChange: planSoon });
   document.addEventListener("rig-changed", ({ detail }) => {
     // A run that another browser or the command line started belongs on this page too.
+    speed = detail.speed;
+    showLength();
     if (detail.run && detail.run !== watched && !isStarting) follow(detail.run);
   });
   $("#stop-run").addEventListener("click", async () => {
@@ -43,6 +45,16 @@ function showIdle() {
   showStates($("#states"), STATES.map((name) => ({ name, status: "waiting" })));
 }
 
+let seconds = null;    // bench time of the plan
+let speed = 1;
+
+function showLength() {
+  if (watched || seconds === null) return;
+  $("#left").textContent = speed > 1
+    ? t("calibrate.bench_time_at", { duration: duration(seconds), wall: duration(seconds / speed), speed: speedWord(speed) })
+    : t("calibrate.bench_time", { duration: duration(seconds) });
+}
+
 let planTimer;
 function planSoon() {
   setup.refuse(null);
@@ -58,7 +70,8 @@ async function plan() {
     const planned = await api.plan({ ...body, board: body.board || "board" });
     if (watched) return;
     showStates($("#states"), planned.states.map((state) => ({ ...state, status: "waiting" })));
-    $("#left").textContent = t("calibrate.bench_time", { duration: duration(planned.seconds) });
+    seconds = planned.seconds;
+    showLength();
     setup.refuse(null);
   } catch (problem) {
     setup.refuse(problem);
@@ -109,13 +122,15 @@ async function follow(id) {
   const names = run.states.map((state) => state.name);
   const shownResults = new Map();
   let latest = null;
-  let timer = null;
+  let asked = null;
+  let drawn = 0;
 
-  function draw() {
-    timer = null;
-    const soFar = latest;
-    plots.show(soFar);
-    showProgress(names, soFar);
+  function draw(now) {
+    if (now - drawn < FRAME_MS) { asked = requestAnimationFrame(draw); return; }
+    asked = null;
+    drawn = now;
+    plots.show(latest);
+    showProgress(names, latest);
   }
 
   function showResults(results) {
@@ -134,13 +149,13 @@ async function follow(id) {
   const unwatch = watch(id, {
     onFrame(soFar) {
       latest = soFar;
-      timer ??= setTimeout(() => requestAnimationFrame(draw), FRAME_MS);
+      asked ??= requestAnimationFrame(draw);
       showResults(soFar.results);
       if (soFar.ended) end(id);
     },
     onConnection: (text) => notice("live", text, "fail"),
   });
-  leave = () => { unwatch(); plots.destroy(); clearTimeout(timer); };
+  leave = () => { unwatch(); plots.destroy(); cancelAnimationFrame(asked); };
 }
 
 function showProgress(names, soFar) {

@@ -4,7 +4,7 @@ import { api } from "../api.js";
 import { facts, h, say, table } from "../dom.js";
 import { rigCard } from "../rig_card.js";
 import { page, rigSentence } from "../shell.js";
-import { plain, t, when } from "../text.js";
+import { plain, t } from "../text.js";
 
 page("rig", async (main) => {
   const state = h("p", { class: "muted" });
@@ -28,7 +28,7 @@ page("rig", async (main) => {
   document.addEventListener("rig-changed", ({ detail: rig }) => {
     state.textContent = rigSentence(rig);
     choose.show(rig);
-    told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder, until: when(rig.lease.expires_at) }) : t("rig.no_lease");
+    told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder }) : t("rig.no_lease");
     limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
       table(["", { n: t("rig.from") }, { n: t("rig.to") }, { n: t("rig.top_speed") }],
         Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: `${plain(a.min_deg)}°` }, { n: `${plain(a.max_deg)}°` }, { n: `${plain(a.max_rate_dps)} deg/s` }]), { label: t("rig.limits") }));

@@ -60,7 +60,7 @@ function showRun(main, run) {
         [t("setup.operator"), run.operator], [t("setup.note"), run.note], [t("setup.temperature"), run.conditions?.room_temperature_degC == null ? null : fixed(run.conditions.room_temperature_degC, 1)],
         [t("rig.rig"), run.rig], [t("setup.readings"), run.readings], [t("run.seed"), run.seed == null ? null : String(run.seed)],
         [t("run.length"), run.duration_s == null ? null : duration(run.duration_s)],
-        [t("run.certificate"), run.certificate]]),
+        [t("run.certificate"), run.certificate]], true),
       h("div", { class: "row" },
         isOn ? h("a", { class: "button main", href: `/?run=${encodeURIComponent(run.id)}` }, t("run.watch")) : null,
         ...(run.certificate ? ["pdf", "csv", "json"].map((kind, i) => h("a", { class: `button ${i ? "" : "main"}`, href: links.document(run.certificate, kind), download: "" }, t(`document.${kind}`))) : []),
@@ -89,9 +89,12 @@ function showRun(main, run) {
 /** Thesis 4.17, 4.18, 5.7 to 5.9: rate and integrated angle against the encoder, with the datasheet's parameters and the estimated ones. */
 async function comparison(card, run, axis) {
   const place = h("div", { class: "stack" }, h("h3", {}, t("run.comparison", { axis })));
+  const waiting = h("p", { class: "muted small" }, t("run.comparing"));
+  place.append(waiting);
   card.append(place);
   let data;
-  try { data = await api.comparison(run.id, axis); } catch (problem) { place.append(h("p", { class: "error" }, problem.message)); return; }
+  try { data = await api.comparison(run.id, axis); } catch (problem) { waiting.textContent = problem.message; return; }
+  waiting.remove();
   const charts = h("div", { class: "charts" });
   place.append(
     table([t("run.parameters"), { n: t("run.rate_rms") }, { n: t("run.angle_rms") }], ["datasheet", "estimated"].map((key) => [
