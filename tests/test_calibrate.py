@@ -3,6 +3,7 @@
 import gzip
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from shared import ROOT
 from calib_core.recording import read, write_csv
 from server import cli
 from server.store import Store
+from server.store_recordings import Recordings
 
 COMMAND = ("calibrate", "--board", "LPY-1", "--readings", "5", "--speed", "max", "--seed", "1", "--operator", "Ada")
 
@@ -196,3 +198,21 @@ def test_the_exported_recording_names_what_it_was_made_with(exported: Path) -> N
     assert header["profile"] == "standard"
     assert header["seed"] == "1"
     assert json.loads(header["gyro_model"])["id"] == "LPY503AL-OUT"
+
+
+def test_ctrl_c_stops_the_run_keeps_its_samples_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compact = Recordings.compact
+    monkeypatch.setattr(Recordings, "compact", lambda *a: (signal.raise_signal(signal.SIGINT), compact(*a))[1])
+    words = ["calibrate", "--board", "S", "--readings", "3", "--data", str(tmp_path), "--out", str(tmp_path), "--json"]
+    assert cli.main(words) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["verdict"] == "error"
+    assert said.err.count("\n") == 1
+    with Store(tmp_path) as store:
+        [run] = store.runs.find()[0]
+        assert run["status"] == "stopped"
+        assert len(store.recording(run["recording"])) > 10_000
+        assert store.certificates.find() == ([], None)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

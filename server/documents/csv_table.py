@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from calib_core.certificate import FIELDS
+from server.texts import render
 
 COLUMNS = (
     "section", "axis", "name", "set_point", "reading", "value", "standard_uncertainty", "expanded_uncertainty", "unit",
@@ -44,7 +45,11 @@ def _rows(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             for point in points:
                 yield from _point(name, state, test, point)
     for warning in content["warnings"]:
-        yield {"section": "warning", "name": warning["code"], "value": _text(warning["values"])}
+        yield {
+            "section": "warning",
+            "name": warning["code"],
+            "value": render(f"warning.{warning['code']}", warning["values"]),
+        }
 
 
 def _point(name: str, state: Mapping[str, Any], test: str, point: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
