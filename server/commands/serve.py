@@ -13,6 +13,8 @@ from server.settings import LOOPBACK, Settings, checked_speed, data_dir
 
 EXAMPLE = "gyrobench serve --port 8080 --data ./lab --rig 'twin:?seed=7' --speed 20"
 
+SEND_BUFFER = 1 << 16
+
 
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this computer only)")
@@ -64,6 +66,8 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         if sys.platform != "win32":  # there it would let two servers share the port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # A live viewer who stalls is felt after a few frames, and gets the newest, not a minute of old ones, later.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         listener.bind((host, port))
         listener.listen(256)
         return listener
