@@ -7,6 +7,7 @@ start together, each after its own `start_s`. Nothing here moves anything or kno
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,11 +89,11 @@ class State:
     kind: str
     steps: tuple[Step, ...]
 
-    @property
+    @cached_property
     def duration_s(self) -> float:
         return sum(step.duration_s for step in self.steps)
 
-    @property
+    @cached_property
     def readings(self) -> int:
         """How many test readings it takes (segments with slashes)."""
         return sum("/" in step.segment for step in self.steps)
@@ -164,7 +165,7 @@ class Plan:
     states: tuple[State, ...]
     gyro_model: GyroModel = field(compare=False)
 
-    @property
+    @cached_property
     def duration_s(self) -> float:
         return sum(state.duration_s for state in self.states)
 
