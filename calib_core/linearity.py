@@ -16,7 +16,7 @@ from calib_core.uncertainty import coverage_factor
 
 F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-Warning_ = dict[str, Any]
+Told = dict[str, Any]
 
 CI = 0.25
 """The width of the confidence interval that the thesis asks of a mean, in the reading's unit (5.3-5.6)."""
@@ -192,7 +192,7 @@ class TestResult:
     repeatability: Repeatability | None
     type_b: float
     ci: float = CI
-    warnings: list[Warning_] = field(default_factory=list)
+    warnings: list[Told] = field(default_factory=list)
 
     @property
     def sample_size(self) -> SampleSize | None:
@@ -280,7 +280,7 @@ def evaluate(
     type_b: float = 0.0,
     ci: float = CI,
     expected: Mapping[str, Sequence[float]] | None = None,
-    warnings: Sequence[Warning_] = (),
+    warnings: Sequence[Told] = (),
 ) -> TestResult:
     """Everything that thesis 5.1-5.9 says of one axis' readings.
 
@@ -307,12 +307,12 @@ def evaluate(
     return result
 
 
-def word(test: str) -> Warning_:
+def word(test: str) -> Told:
     """The name of a test inside a sentence, said in the reader's language."""
     return {"code": f"test_name.{test}", "values": {}}
 
 
-def _missing(test: str, present: tuple[SetPoint, ...], expected: Sequence[float], unit: str) -> list[Warning_]:
+def _missing(test: str, present: tuple[SetPoint, ...], expected: Sequence[float], unit: str) -> list[Told]:
     there = {round(point.set_point, 6) for point in present}  # what a segment's name resolves
     absent = [at for at in expected if round(at, 6) not in there]
     named = {"test": word(test), "unit": unit}

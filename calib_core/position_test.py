@@ -1,16 +1,17 @@
 """The position test (thesis 5.1-5.9 on angles): the compensated gyro's integral against the encoder, rest to rest."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from calib_core import linearity
 from calib_core.points import Points
-from calib_core.rate_test import Readings
 from calib_core.recording import Recording
 from calib_core.sequence import PROFILES
-from calib_core.strokes import F64, Strokes, filtered, find, integral_at
+from calib_core.strokes import F64, Readings, Strokes, filtered, find, integral_at
 
 FULL_SCALE_DEG = 240.0
 AT_REST_STEPS = 1.5
@@ -51,7 +52,7 @@ def run(
         found.points,
         full_scale,
         kind="position",
-        type_b=float(np.hypot(np.hypot(encoder, drift), scale)),
+        type_b=math.hypot(encoder, drift, scale),
         ci=ci,
         expected=expected(profile, full_scale),
         warnings=found.warnings,
@@ -80,68 +81,61 @@ def readings(recording: Recording, axis: str, bias: float, scale_factor: float, 
         # The filter starts each reading from rest: the way back would still be in it.
         inside = recording.where(lambda name: name.startswith(f"position_{axis}/"))
         rate = filtered(recording.time_s, np.where(inside, rate, 0.0))
-    before, after, leave, arrive = rests(strokes)
-    begin = strokes.start_s + SETTLED * np.maximum(leave - strokes.start_s, 0.0)
-    end = strokes.stop_s
-    area = integral_at(recording.time_s + gyro.delay_s, rate, np.concatenate([begin, end]))
+    rest = rests(strokes)
+    begin = rest.from_s + SETTLED * (rest.leave_s - rest.from_s)
+    area = integral_at(recording.time_s + gyro.delay_s, rate, np.concatenate([begin, rest.until_s]))
     measured = area[len(strokes) :] - area[: len(strokes)]
-    reference = after - before
-    wanted = np.array([segment.set_point for segment in strokes.segments])
-    kept = _keep(strokes, reference, wanted, leave, arrive, warnings)
-    taken = [strokes.segments[i] for i in kept]
+    reference = rest.after_deg - rest.before_deg
+    kept = _keep(strokes, reference, rest, warnings)
     # One draw of a step's uniform error at each rest (METHOD 2); the difference has both.
-    u = strokes.step_deg / 12**0.5 * 2**0.5
-    return Readings(
-        Points(
-            board=np.full(len(kept), recording.header.get("board", "")),
-            axis=np.full(len(kept), axis),
-            kind="position",
-            test=np.array([segment.test for segment in taken], dtype=str),
-            set_point=wanted[kept],
-            reference=reference[kept],
-            gyro=measured[kept],
-            reading=np.array([segment.reading for segment in taken], dtype=np.int64),
-            duration_s=(end - begin)[kept],
-        ),
-        np.full(len(kept), u),
-        warnings,
-    )
+    u = np.full(len(strokes), strokes.step_deg / 12**0.5 * 2**0.5)
+    return strokes.readings("position", kept, reference, measured, rest.until_s - begin, u, warnings)
 
 
-def rests(strokes: Strokes) -> tuple[F64, F64, F64, F64]:
-    """(k,) the encoder at the rest before and after each move, the time the table leaves and the time it arrives."""
-    time, of = strokes.time_s, strokes.of
-    first, last = (
-        np.isin(time, edge) for edge in (strokes.first(time, time == time), strokes.last(time, time == time))
-    )
+@dataclass(frozen=True, eq=False)
+class Rests:
+    """Each move's (k,) rests as the encoder saw them: their levels, and when the table left and arrived.
+
+    ``from_s`` and ``until_s`` are the encoder's first and last reading; NaN or inf where there is no move.
+    """
+
+    before_deg: F64
+    after_deg: F64
+    from_s: F64
+    leave_s: F64
+    arrive_s: F64
+    until_s: F64
+
+
+def rests(strokes: Strokes) -> Rests:
+    """The rests before and after each move, each collapsed to one level."""
+    time, angle, of = strokes.time_s, strokes.angle_deg, strokes.of
+    everything = np.ones(len(time), bool)
+    from_s, until_s = strokes.first(time, everything), strokes.last(time, everything)
+    start, stop = (strokes.mean(angle, time == edge[of]) for edge in (from_s, until_s))
     tolerance = AT_REST_STEPS * strokes.step_deg
-    start = strokes.mean(strokes.angle_deg, first)
-    stop = strokes.mean(strokes.angle_deg, last)
-    leave = strokes.first(time, np.abs(strokes.angle_deg - start[of]) > tolerance)
-    arrive = strokes.last(time, np.abs(strokes.angle_deg - stop[of]) > tolerance)
-    settled_from = strokes.stop_s - SETTLED * (strokes.stop_s - arrive)
-    before = strokes.mean(strokes.angle_deg, time < leave[of])
-    after = strokes.mean(strokes.angle_deg, time >= settled_from[of])
-    return before, after, leave, arrive
+    leave = strokes.first(time, np.abs(angle - start[of]) > tolerance)
+    arrive = strokes.last(time, np.abs(angle - stop[of]) > tolerance)
+    with np.errstate(invalid="ignore"):
+        settled = until_s - SETTLED * (until_s - arrive)
+    before, after = strokes.mean(angle, time < leave[of]), strokes.mean(angle, time >= settled[of])
+    return Rests(before, after, from_s, leave, arrive, until_s)
 
 
-def _keep(
-    strokes: Strokes, angle: F64, wanted: F64, leave: F64, arrive: F64, warnings: list[dict[str, Any]]
-) -> list[int]:
+def _keep(strokes: Strokes, angle: F64, rest: Rests, warnings: list[dict[str, Any]]) -> list[int]:
     """Which moves have a reading; says of the others why not, and of those kept what is odd about them."""
     kept = []
-    for i in range(len(strokes)):
-        values = {"measured": float(angle[i]), "least_s": LEAST_REST_S}
-        before_s, after_s = float(leave[i] - strokes.start_s[i]), float(strokes.stop_s[i] - arrive[i])
-        if strokes.holed[i]:
-            warnings.append(strokes.warning("position_test.gyro_missing", i))
-        elif not (np.isfinite(leave[i]) and np.isfinite(arrive[i])):
+    for i, segment in enumerate(strokes.segments):
+        before_s, after_s = float(rest.leave_s[i] - rest.from_s[i]), float(rest.until_s[i] - rest.arrive_s[i])
+        values = {"before_s": before_s, "after_s": after_s, "least_s": LEAST_REST_S}
+        if unusable := strokes.unusable(i):
+            warnings.append(unusable)
+        elif not np.isfinite(rest.leave_s[i]):
             warnings.append(strokes.warning("position_test.no_move", i))
         elif min(before_s, after_s) < LEAST_REST_S:
-            values |= {"before_s": before_s, "after_s": after_s}
             warnings.append(strokes.warning("position_test.not_at_rest", i, **values))
         else:
             kept.append(i)
-            if abs(angle[i] - wanted[i]) > OFF_TARGET_DEG:
-                warnings.append(strokes.warning("position_test.off_target", i, **values))
+            if abs(angle[i] - segment.set_point) > OFF_TARGET_DEG:
+                warnings.append(strokes.warning("position_test.off_target", i, measured=float(angle[i])))
     return kept

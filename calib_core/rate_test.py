@@ -1,7 +1,7 @@
 """The rate test (thesis 5.1-5.9): constant-rate strokes, the encoder's rate against the compensated gyro's."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from calib_core.adaptation import THESIS_SPAN_S
 from calib_core.points import Points
 from calib_core.recording import Recording
 from calib_core.sequence import PROFILES
-from calib_core.strokes import F64, Mask, Strokes, filtered, find, integral_at, run_lengths
+from calib_core.strokes import F64, Mask, Readings, Strokes, filtered, find, integral_at, run_lengths
 
 FULL_SCALE_DPS = 200.0
 LEAST_STEPS = 5
@@ -22,15 +22,6 @@ SHORTEST_S = 0.3
 """The least constant-rate stretch that is worth a slope."""
 OFF_SPEED = 0.1
 """The table is told to be off when its measured rate differs from the set-point by this part of it and 1 deg/s."""
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Readings as ``points``, the standard uncertainty of each reference, and what has to be said about them."""
-
-    points: Points
-    reference_u: F64
-    warnings: list[dict[str, Any]]
 
 
 def points(recording: Recording, axis: str, bias: float, scale_factor: float, profile: str = "standard") -> Points:
@@ -55,13 +46,13 @@ def run(
     Type B joins what all readings share: the encoder's step (2.22), the bias and the scale factor that compensate.
     """
     found = readings(recording, axis, bias, scale_factor, profile)
-    reference = float(found.reference_u.max(initial=0.0))
+    encoder = float(found.reference_u.max(initial=0.0))
     scale = float(np.abs(found.points.reference).max(initial=0.0)) * scale_factor_u / scale_factor
     return linearity.evaluate(
         found.points,
         full_scale,
         kind="rate",
-        type_b=float(np.hypot(np.hypot(reference, bias_u / scale_factor), scale)),
+        type_b=math.hypot(encoder, bias_u / scale_factor, scale),
         ci=ci,
         expected=expected(profile, full_scale),
         warnings=found.warnings,
@@ -94,8 +85,7 @@ def readings(recording: Recording, axis: str, bias: float, scale_factor: float, 
     reference, middle, spread = strokes.slope(strokes.angle_deg, weight)
     begin, end = strokes.first(strokes.time_s, constant), strokes.last(strokes.time_s, constant)
     duration = np.where(np.isfinite(begin), end - begin, 0.0)
-    wanted = np.array([segment.set_point for segment in strokes.segments])
-    kept = _keep(strokes, duration, reference, wanted, warnings)
+    kept = _keep(strokes, duration, reference, warnings)
     if profile == "thesis":
         reference, measured = _thesis(strokes, recording, axis, middle, gyro_time, rate)
         # Each end of the difference is off by up to half a step (2.22), independently.
@@ -104,22 +94,7 @@ def readings(recording: Recording, axis: str, bias: float, scale_factor: float, 
         measured, _, _ = strokes.slope(integral_at(gyro_time, rate, strokes.time_s), weight)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = strokes.step_deg / 12**0.5 / np.sqrt(spread)
-    taken = [strokes.segments[i] for i in kept]
-    return Readings(
-        Points(
-            board=np.full(len(kept), recording.header.get("board", "")),
-            axis=np.full(len(kept), axis),
-            kind="rate",
-            test=np.array([segment.test for segment in taken], dtype=str),
-            set_point=wanted[kept],
-            reference=reference[kept],
-            gyro=measured[kept],
-            reading=np.array([segment.reading for segment in taken], dtype=np.int64),
-            duration_s=duration[kept],
-        ),
-        u[kept],
-        warnings,
-    )
+    return strokes.readings("rate", kept, reference, measured, duration, u, warnings)
 
 
 def steady(strokes: Strokes) -> Mask:
@@ -152,18 +127,18 @@ def code_weight(strokes: Strokes, where: Mask) -> F64:
     return np.where(where, 1.0 / np.maximum(1.0, run_lengths(strokes.angle_deg, strokes.of) / 2.0), 0.0)
 
 
-def _keep(strokes: Strokes, duration: F64, rate: F64, wanted: F64, warnings: list[dict[str, Any]]) -> list[int]:
+def _keep(strokes: Strokes, duration: F64, rate: F64, warnings: list[dict[str, Any]]) -> list[int]:
     """Which strokes have a reading; says of the others why not, and of those kept what is odd about them."""
     kept = []
-    for i in range(len(strokes)):
+    for i, segment in enumerate(strokes.segments):
         values = {"measured": float(rate[i]), "duration_s": float(duration[i]), "least_s": SHORTEST_S}
-        if strokes.holed[i]:
-            warnings.append(strokes.warning("rate_test.gyro_missing", i))
+        if unusable := strokes.unusable(i):
+            warnings.append(unusable)
         elif not duration[i] >= SHORTEST_S:
             warnings.append(strokes.warning("rate_test.no_constant_rate", i, **values))
         else:
             kept.append(i)
-            if abs(rate[i] - wanted[i]) > OFF_SPEED * abs(wanted[i]) + 1.0:
+            if abs(rate[i] - segment.set_point) > OFF_SPEED * abs(segment.set_point) + 1.0:
                 warnings.append(strokes.warning("rate_test.off_speed", i, **values))
             elif duration[i] < 0.5 * (strokes.stop_s[i] - strokes.start_s[i]):
                 warnings.append(strokes.warning("rate_test.short_stretch", i, **values))

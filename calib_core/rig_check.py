@@ -47,7 +47,7 @@ def step(recording: Recording, axis: str, to_deg: float = TO_DEG, rate_dps: floa
     segment = Segment("rate", axis, "step", rate_dps, 1)
     strokes = collect(recording, axis, {segment: (run.start, run.stop - 1)})
     slope, _, _ = strokes.slope(strokes.angle_deg, code_weight(strokes, steady(strokes)))
-    _, after, leave, arrive = rests(strokes)
-    if not (np.isfinite(slope[0]) and leave[0] < arrive[0] < strokes.stop_s[0]):
+    rest = rests(strokes)
+    if not (np.isfinite(slope[0]) and rest.leave_s[0] < rest.arrive_s[0] < rest.until_s[0]):
         raise Problem("rig_check.no_step", axis=axis, to_deg=to_deg, rate_dps=rate_dps)
-    return StepCheck(to_deg, rate_dps, float(after[0]), abs(float(slope[0])))
+    return StepCheck(to_deg, rate_dps, float(rest.after_deg[0] - rest.before_deg[0]), abs(float(slope[0])))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from calib_core.kalman import filter_record, tuning
 from calib_core.linearity import word
+from calib_core.points import Points
 from calib_core.recording import Recording, Segment, parse_segment
 
 F64 = npt.NDArray[np.float64]
@@ -28,13 +29,17 @@ class Strokes:
     """The readings of one test ("rate" or "position") on one axis, in time order, k strokes.
 
     ``time_s`` (m,) and ``angle_deg`` (m,) are encoder readings at their own times, ``of`` (m,) the stroke of each;
-    ``start_s`` and ``stop_s`` (k,) the segments' first and last sample, ``holed`` (k,) where gyro samples are missing.
+    ``start_s`` and ``stop_s`` (k,) the segments' first and last sample; ``holed`` (k,) where gyro samples are missing,
+    ``unread`` (k,) where the encoder has no reading at all.
     """
 
+    board: str
+    axis: str
     segments: tuple[Segment, ...]
     start_s: F64
     stop_s: F64
     holed: Mask
+    unread: Mask
     time_s: F64
     angle_deg: F64
     of: I64
@@ -74,10 +79,49 @@ class Strokes:
             spread = self.total(weight * u * u)
             return self.total(weight * u * np.where(weight > 0, values, 0.0)) / spread, mean_time, spread
 
+    def readings(
+        self,
+        kind: str,
+        kept: list[int],
+        reference: F64,
+        gyro: F64,
+        duration_s: F64,
+        reference_u: F64,
+        warnings: list[dict[str, Any]],
+    ) -> "Readings":
+        """Of the strokes ``kept``; references, gyro, durations and uncertainties are (k,)."""
+        taken = [self.segments[i] for i in kept]
+        points = Points(
+            board=np.full(len(kept), self.board),
+            axis=np.full(len(kept), self.axis),
+            kind=kind,
+            test=np.array([segment.test for segment in taken], dtype=str),
+            set_point=np.array([segment.set_point for segment in taken]),
+            reference=reference[kept],
+            gyro=gyro[kept],
+            reading=np.array([segment.reading for segment in taken], dtype=np.int64),
+            duration_s=duration_s[kept],
+        )
+        return Readings(points, reference_u[kept], warnings)
+
+    def unusable(self, i: int) -> dict[str, Any] | None:
+        """The warning of a stroke that no test can read."""
+        code = "test.gyro_missing" if self.holed[i] else "test.no_encoder" if self.unread[i] else None
+        return self.warning(code, i) if code else None
+
     def warning(self, code: str, i: int, **values: object) -> dict[str, Any]:
         segment = self.segments[i]
         place = {"axis": segment.axis, "set_point": segment.set_point, "reading": segment.reading}
         return {"code": code, "values": {"test": word(segment.test), **place, **values}}
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Readings as ``points`` (n,), the standard uncertainty of each reference, and what has to be said about them."""
+
+    points: Points
+    reference_u: F64
+    warnings: list[dict[str, Any]]
 
 
 def find(recording: Recording, kind: str, axis: str) -> tuple[Strokes, list[dict[str, Any]]]:
@@ -108,10 +152,13 @@ def collect(recording: Recording, axis: str, stretches: Mapping[Segment, tuple[i
     of = np.repeat(np.arange(len(rows)), count)
     at = np.arange(len(of)) + np.repeat(low - np.concatenate([[0], np.cumsum(count)])[:-1], count)
     return Strokes(
+        recording.header.get("board", ""),
+        axis,
         tuple(stretches),
         start_s,
         stop_s,
         _holed(sampled, start_s, stop_s),
+        count == 0,
         time_s[at],
         angle[at],
         of,
@@ -159,7 +206,8 @@ def integral_at(time_s: F64, rate: F64, at_s: F64) -> F64:
     area = np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]) * dt)])
     i = np.clip(np.searchsorted(t, at_s, side="right") - 1, 0, len(t) - 2)
     h = at_s - t[i]
-    out: F64 = area[i] + h * (w[i] + 0.5 * h * (w[i + 1] - w[i]) / dt[i])
+    with np.errstate(invalid="ignore"):  # a stroke without its encoder has no times
+        out: F64 = area[i] + h * (w[i] + 0.5 * h * (w[i + 1] - w[i]) / dt[i])
     return out
 
 

@@ -64,7 +64,7 @@ def rate_moves(set_points=(-60, -20, 10, 60, 100), readings=2, test="linearity")
             moves.append(("move", at, -end, 120.0, 0.0, 0.3))
             moves.append((f"rate_x/{test}/{rate:+g}/{reading}", -end, end, abs(rate), 0.0, 0.4))
             at = end
-    return moves
+    return [*moves, ("move", at, 0.0, 120.0, 0.0, 0.3)]
 
 
 def position_moves(set_points=(-120, -30, 30, 90), readings=2, test="linearity"):

@@ -2,14 +2,16 @@
 
 import csv
 import json
+import re
 from decimal import Decimal
 
 import numpy as np
 import pytest
-from shared import shared
+from shared import ROOT, shared
 
 from calib_core import linearity
 from calib_core.points import Points
+from server.texts import texts
 
 
 def made(test: str, set_points: list[float], readings: list[list[float]]) -> Points:
@@ -87,6 +89,18 @@ def test_what_is_missing_is_said() -> None:
     assert told["test.readings_missing"] | {"set_point": 20.0, "got": 2, "of": 3} == told["test.readings_missing"]
     assert result.repeatability is None
     assert result.to_json()["repeatability_pct_fs"] is None
+
+
+@pytest.mark.parametrize("lang", ["en", "th"])
+def test_every_warning_of_the_tests_has_its_words(lang: str) -> None:
+    core = ROOT / "calib_core"
+    sources = [*core.glob("*_test.py"), *(core / f"{name}.py" for name in ("linearity", "strokes", "rig_check"))]
+    pattern = r'"((?:test|rate_test|position_test|rig_check|sample_size)\.[a-z_]+)"'
+    codes = {code for path in sources for code in re.findall(pattern, path.read_text(encoding="utf-8"))}
+    assert len(codes) > 10
+    known = set(texts(lang))
+    assert [code for code in sorted(codes) if not known & {code, f"warning.{code}", f"error.{code}"}] == []
+    assert {"test_name.linearity", "test_name.repeat"} <= known
 
 
 def test_an_empty_test_is_a_result_without_numbers() -> None:
