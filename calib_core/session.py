@@ -14,7 +14,7 @@ import numpy as np
 
 from calib_core import adaptation, integral_fit, kalman, position_test, rate_test, rig_check
 from calib_core.certificate import FIELDS
-from calib_core.gyro_models import PRESETS, GyroModel, ranges_from_json
+from calib_core.gyro_models import PRESETS, GyroModel, Ranges, ranges_from_json
 from calib_core.problem import Problem
 from calib_core.recording import Recording, parse_segment
 from calib_core.sequence import PROFILES, STATES
@@ -27,7 +27,7 @@ NOISE_GREW = 2.0
 """Noise density in motion over the one at rest past which a fixed gain is wrong (METHOD 1)."""
 LEAST_REST = 50
 """Rows of a hold that tell its noise."""
-LEAST_ANSWER = 0.2
+LEAST_ANSWER = 0.1
 """A scale factor below this part of the datasheet's is a gyro that is not connected, not a bad one."""
 # Real, and of unknown size on a rig without calibration records of its own: named, never guessed.
 EXCLUDED = {
@@ -196,8 +196,10 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
     warnings += _filter_warnings(difference, moving_density / rest_density)
     if fit.scale_factor * datasheet.scale_factor_V_per_dps < 0:
         warnings.append({"code": "session.reversed", "values": {"axis": axis}})
+    ranges = _ranges(recording, axis, gyro_model)
+    step_dps = PROFILES[profile].step_dps * ranges.rate_dps / Ranges().rate_dps
     try:
-        step = rig_check.step(recording, axis)
+        step = rig_check.step(recording, axis, ranges.position_deg, min(step_dps, datasheet.range_dps))
     except Problem as problem:  # the table's own check says nothing about the gyro
         step = None
         warnings.append({"code": problem.code, "values": problem.values})
@@ -304,12 +306,17 @@ def _filter_warnings(difference_V: float, noise_ratio: float) -> list[Result]:
 def _full_scale(recording: Recording, state: str, gyro_model: GyroModel) -> float:
     """r0, the span: twice the range that the header says the plan used, else twice the largest set-point there is."""
     kind, axis = state.split("_")
-    name = "rate_dps" if kind == "rate" else "position_deg"
     if "ranges" in recording.header:
-        given = _json_header(recording, "ranges").get(axis)
-        return 2.0 * float(getattr(ranges_from_json(given, gyro_model.ranges[axis]), name))
+        ranges = _ranges(recording, axis, gyro_model)
+        return 2.0 * (ranges.rate_dps if kind == "rate" else ranges.position_deg)
     segments = [segment for segment in map(parse_segment, recording.segment_names) if segment]
     return 2.0 * max(abs(segment.set_point) for segment in segments if segment.state == state)
+
+
+def _ranges(recording: Recording, axis: str, gyro_model: GyroModel) -> Ranges:
+    """What the plan used, by the header; else the gyro model's."""
+    given = _json_header(recording, "ranges").get(axis) if "ranges" in recording.header else None
+    return ranges_from_json(given, gyro_model.ranges[axis])
 
 
 def _json_header(recording: Recording, key: str) -> Mapping[str, Any]:

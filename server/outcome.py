@@ -41,8 +41,7 @@ def certified(content: Mapping[str, Any], out: Path, lang: str, *, file: str | N
         "error": None,
         "axes": content["axes"],
         "warnings": [
-            {**warning, "sentence": render(f"warning.{warning['code']}", warning["values"], lang)}
-            for warning in content["warnings"]
+            {**warning, "sentence": documents.warning_sentence(warning, lang)} for warning in content["warnings"]
         ],
         "documents": write_documents(content, out, lang),
         "recording": content["recording"]["id"],

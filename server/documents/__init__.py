@@ -5,9 +5,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from calib_core.problem import Problem
+from server import texts
 
 FORMATS = ("pdf", "csv", "json")
 MEDIA_TYPES = {"pdf": "application/pdf", "csv": "text/csv; charset=utf-8", "json": "application/json"}
+
+
+def warning_sentence(warning: Mapping[str, Any], lang: str = "en") -> str:
+    """What a warning says, with the state it is about."""
+    state = f"{texts.render('state.' + warning['state'], {}, lang)}: " if "state" in warning else ""
+    return state + texts.render(f"warning.{warning['code']}", warning["values"], lang)
 
 
 def render(content: Mapping[str, Any], kind: str, lang: str = "en") -> bytes:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from calib_core.certificate import FIELDS
-from server.texts import render
+from server.documents import warning_sentence
 
 COLUMNS = (
     "section", "axis", "name", "set_point", "reading", "value", "standard_uncertainty", "expanded_uncertainty", "unit",
@@ -48,7 +48,7 @@ def _rows(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         yield {
             "section": "warning",
             "name": warning["code"],
-            "value": render(f"warning.{warning['code']}", warning["values"]),
+            "value": warning_sentence(warning),
         }
 
 

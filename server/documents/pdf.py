@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_core.certificate import FIELDS, Field, two_digits
+from server.documents import warning_sentence
 from server.texts import render
 
 TEMPLATE = Path(__file__).with_name("certificate.typ")
@@ -69,7 +70,7 @@ def page(content: Mapping[str, Any], lang: str) -> dict[str, Any]:
         },
         "warnings": {
             "title": say("warnings"),
-            "rows": [inert(render(f"warning.{told['code']}", told["values"], lang)) for told in content["warnings"]],
+            "rows": [inert(warning_sentence(told, lang)) for told in content["warnings"]],
         },
         "authorised": say("authorised"),
         "digest": content["recording"]["digest"],
