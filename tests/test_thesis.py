@@ -4,13 +4,14 @@ import csv
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from shared import shared
 
-from calib_core.thesis import printed, report, simulation
+from calib_core.thesis import compare, printed, report, simulation, tables
 from server import cli
 from server.texts import render, texts
 
@@ -125,6 +126,37 @@ def test_every_table_is_there_with_printed_and_recomputed_side_by_side(found: di
     for name in ("4.1", "5.1", "5.2", "5.19"):
         assert all(row["recomputed"] is None for row in tables[name])
         assert all(row["printed"] is not None for row in tables[name])
+
+
+@pytest.mark.parametrize(
+    ("place", "misprint", "code"),
+    [
+        (("5.7", "1", "x", "60", "mean"), "58.1539", "not_reproduced"),
+        (("5.17", "2", "x", "120", "bias_error"), "4.8982", "bias_error_alone"),
+        (("fig 5.14-5.17", "2", "x", "", "slope"), "1.051", "not_reproduced"),
+        (("5.20", "1", "x", "", "max_random_error"), "4.3538", "doubled_twice"),
+        (("5.20", "1", "x", "", "nonlinearity"), "1.12", "truncated"),
+        (("5.21", "1", "x", "", "max_bias_error"), "3.4114", "summary_differs"),
+    ],
+)
+def test_a_misprint_made_here_is_found_too(place: tuple[str, ...], misprint: str, code: str) -> None:
+    """What is found comes from comparing: nothing would know of these."""
+    key = printed.Key(*place)
+    cells = printed.cells()
+    tests = tables.tests()
+    values = tables.recompute(tests)
+    wrong = {**cells, key: replace(cells[key], printed=misprint)}
+    before = {one.key for one in compare.disagreements(cells, values, tests)}
+    after = {one.key: one.code for one in compare.disagreements(wrong, values, tests)}
+    assert key not in before
+    assert after[key] == code
+
+
+def test_a_printed_value_put_right_is_no_longer_found() -> None:
+    key = printed.Key("5.8", "1", "z", "60", "bias_error")
+    cells, tests = printed.cells(), tables.tests()
+    right = {**cells, key: replace(cells[key], printed="2.1692")}
+    assert key not in {one.key for one in compare.disagreements(right, tables.recompute(tests), tests)}
 
 
 @pytest.mark.parametrize("lang", ["en", "th"])
