@@ -122,7 +122,7 @@ class Design:
         s = self.averages.samples
         return self.averages.mean(s.output, shift_s=delay_s, average_s=s.average_s)
 
-    def columns(self, delay_s: float, scale_factor: float) -> F64:
+    def columns(self, delay_s: float, values: F64) -> F64:
         """(n, p) bias; then, where something moved, rate and delay (s, as a change from ``delay_s``)."""
         one = np.ones(len(self.rows))
         if not self.moves:
@@ -131,34 +131,43 @@ class Design:
             s = self.averages.samples
             grid = s.time_s[self.averages.at]
             rate = np.interp(grid - delay_s, grid, self.rate)
-            return np.column_stack([one, rate, -scale_factor * np.gradient(rate, grid)])
-        change = self.averages.change(self.averages.samples.output)
+            return np.column_stack([one, rate, -values[1] * np.gradient(rate, grid)])
+        change = self.averages.change(self.averages.samples.output, shift_s=delay_s)
         return np.column_stack([one, self.rate, np.where(self.averages.at < 0, -change, 0.0)])
 
     def solve(self) -> "Solution":
         """Noise and parameters by turns, the delay taken out as it is found and the codes read ever more sharply."""
-        design, y, values = self, self.output(0.0), self._rough()
-        scale_factor = float(values[1]) if len(values) > 1 else 0.0
+        design, delay, values = self, 0.0, self._rough()
+        y = self.output(delay)
         start = RowNoise(first_guess(self.rows, y), reading_deg=self._reading_noise(y, values))
-        noise = fit_noise(self.rows, y, self.columns(0.0, scale_factor), scale_factor, start)
-        delay = 0.0
         step = self.readings.step_deg if self.readings is not None else 0.0
         rounds = ROUNDS if start.reading_deg < SOFTEST * step else 1
-        sites = None
+        sites, noise = None, None
         for turn in range(rounds + 1):
-            columns = design.columns(delay, scale_factor)
-            if turn in (1, rounds):
-                noise = fit_noise(design.rows, y, columns, scale_factor, noise.base, noise)
+            columns = design.columns(delay, values)
+            if noise is None:
+                values, _ = design.estimate(y, columns, start, values)
+                noise = design._noise(y, columns, values, start)
+            elif turn in (1, rounds):
+                noise = design._noise(y, columns, values, noise.base, noise)
             values, covariance = design.estimate(y, columns, noise.noise, values)
-            if len(values) == 1:
-                break
-            delay, values[2], scale_factor = delay + float(values[2]), 0.0, float(values[1])
-            y = self.output(delay)
+            if len(values) > 1:
+                delay, values[2] = delay + float(values[2]), 0.0
+                y = self.output(delay)
             if turn < rounds and rounds > 1:
                 sites = design._sharpened(y, columns, values, noise.noise, sites)
                 design = self._at(sites)
                 noise = replace(noise, base=replace(noise.base, reading_deg=0.0))
+        assert noise is not None
         return Solution(y, columns, values, covariance, delay, noise, sites)
+
+    def _noise(self, y: F64, columns: F64, values: F64, start: RowNoise, near: NoiseFit | None = None) -> NoiseFit:
+        """The noise about the columns; the scale factor of an encoder is kept, for a free one would trade the codes'
+        error, which it multiplies, for noise."""
+        if self.readings is None or len(values) == 1:
+            return fit_noise(self.rows, y, columns, 0.0, start, near)
+        others = np.delete(columns, 1, axis=1)
+        return fit_noise(self.rows, y - columns[:, 1] * values[1], others, float(values[1]), start, near)
 
     def _rough(self) -> F64:
         """Parameters (p,) from the integrals by plain least squares, to start from."""
@@ -273,7 +282,7 @@ def _report(design: Design, solution: Solution) -> Fit:
         warnings.append({"code": "fit.nothing_moved", "values": {}})
     p, noise = len(names), solution.noise.noise
     softness = solution.sites.softness if solution.sites else 0.0
-    columns = design.columns(solution.delay_s, float(solution.values[-1]))
+    columns = design.columns(solution.delay_s, solution.values)
     chi2 = design.chi2(solution.y, columns, noise, solution.values, softness)
     dof = _effective_dof(design, solution)
     s = design.averages.samples

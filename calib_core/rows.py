@@ -64,14 +64,15 @@ class Averages:
             out[between] = (integral(end + shift_s) - integral(begin + shift_s)) / (end - begin)
         return out
 
-    def change(self, values: F64) -> F64:
-        """(n,) (end - beginning)/length of ``values`` (k,) over each interval; for a sample, its slope."""
+    def change(self, values: F64, *, shift_s: float = 0.0) -> F64:
+        """(n,) (end - beginning)/length of ``values`` (k,) over the intervals, moved likewise; for a sample, its slope."""
         s = self.samples
         slope = np.gradient(values, s.time_s)
         out = slope[np.maximum(self.at, 0)]
         between = self.at < 0
         begin, end = self.begin_s[between], self.end_s[between]
-        out[between] = (np.interp(end, s.time_s, values) - np.interp(begin, s.time_s, values)) / (end - begin)
+        ends = (np.interp(t + shift_s, s.time_s, values) for t in (begin, end))
+        out[between] = -np.subtract(*ends) / (end - begin)
         return out
 
 
