@@ -1,6 +1,5 @@
 """A whole six-state run, from the command to its documents, as a process of its own; and its analysis alone."""
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,14 @@ from server.devices import open_rig
 from server.engine import record
 
 SCRIPT = "import sys; from server.cli import main; sys.exit(main())"
+# A process counts the memory of whoever forked it as its own, so a small one stands between; it prints what was used.
+BETWEEN = """
+import resource, subprocess, sys, time
+start = time.perf_counter()
+subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, check=True)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss)
+"""
 
 
 def run(*, quick: bool) -> list[Row]:
@@ -36,12 +43,6 @@ def calibrate() -> tuple[float, float, float]:
     """Wall and CPU seconds and the peak resident size (MB) of `gyrobench calibrate` at full speed."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["calibrate", "--board", "bench", "--rig", "twin:?seed=1", "--data", folder, "--out", folder, "--json"]
-        start = time.perf_counter()
-        process = subprocess.Popen([sys.executable, "-c", SCRIPT, *words], stdout=subprocess.DEVNULL)
-        _, status, used = os.wait4(process.pid, 0)
-        wall_s = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise RuntimeError(f"calibrate left with {process.returncode}")
-    unit = 1024 if sys.platform != "darwin" else 1  # ru_maxrss is kB on Linux, bytes on macOS
-    return wall_s, used.ru_utime + used.ru_stime, used.ru_maxrss * unit / 1e6
+        command = [sys.executable, "-c", BETWEEN, sys.executable, "-c", SCRIPT, *words]
+        wall_s, cpu_s, peak = map(float, subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout.split())
+    return wall_s, cpu_s, peak * (1e-6 if sys.platform == "darwin" else 1024e-6)  # bytes there, kB elsewhere
