@@ -266,8 +266,8 @@ class _Builder:
         return tuple(self.steps)
 
     def _speed(self, dps: float) -> float:
-        """A speed of the profile, scaled like the set-points and inside the sensor's range."""
-        return min(dps * self.rate_scale, self.sensor_dps)
+        """A speed of the profile, slower where the set-points are, and inside the sensor's range."""
+        return min(dps * min(self.rate_scale, 1.0), self.sensor_dps)
 
     def _home(self) -> None:
         """Both axes to 0° from wherever the last run left them: 150° away at most."""

@@ -204,6 +204,8 @@ def _run(
                          progress=_progress(plan, state, before_s, done_s, done))
                     for block in rig.waiting()
                 )  # fmt: skip
+                if abort.is_set():
+                    raise Aborted
                 rig.start(step.motions)
                 for seconds in _blocks(step.duration_s, pace.block_s):
                     if abort.is_set():

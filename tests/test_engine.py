@@ -25,7 +25,8 @@ class Watched(Rig):
 
     def __init__(self, seed: int = 1) -> None:
         self.plant = Plant(seed)
-        self.twin_table, self.twin_daq = TwinTable(self.plant), TwinDaq(self.plant)
+        self.twin_table = TwinTable(self.plant)
+        self.twin_daq = TwinDaq(self.twin_table)
         super().__init__("twin:", self.twin_table, self.twin_daq, simulated=True)
         self.made_safe = 0
 

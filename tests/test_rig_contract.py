@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -43,9 +44,9 @@ class Spy:
 
 
 def twin(seed: int = 1) -> tuple[Rig, TwinTable, TwinDaq, Plant]:
-    plant = Plant(seed)
-    table, daq = TwinTable(plant), TwinDaq(plant)
-    return Rig(f"twin:?seed={seed}", table, daq, simulated=True), table, daq, plant
+    table = TwinTable(Plant(seed))
+    daq = TwinDaq(table)
+    return Rig(f"twin:?seed={seed}", table, daq, simulated=True), table, daq, table.plant
 
 
 def read(rig: Rig, blocks: int) -> None:
@@ -58,8 +59,8 @@ def joined(blocks: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def test_constructors_send_nothing_and_safe_comes_before_anything() -> None:
-    plant = Plant(1)
-    table, daq = Spy(TwinTable(plant)), Spy(TwinDaq(plant))
+    twin_table = TwinTable(Plant(1))
+    table, daq = Spy(twin_table), Spy(TwinDaq(twin_table))
     rig = Rig("twin:", table, daq, simulated=True)
     assert [part["ok"] for part in rig.status()] == [None] * 4
     assert (rig.columns[0], rig.header["rig"]) == ("time_s", "twin:")
@@ -88,6 +89,33 @@ def test_safe_works_from_every_state_twice_in_a_row(rig: Rig) -> None:
     assert np.nanmax(still["x_position_deg"]) == np.nanmin(still["x_position_deg"])
     rig.close()
     let_go()
+
+
+def test_an_emergency_stop_from_another_thread_disturbs_nothing(rig: Rig) -> None:
+    rig.begin()
+    rig.start([Wave("x", (30.0,), (0.25,), 20.0)])
+    with ThreadPoolExecutor(1) as pool:
+        reading = [pool.submit(rig.read, 0.05) for _ in range(200)]
+        for _ in range(50):
+            rig.safe()
+        assert sum(len(job.result().columns["time_s"]) for job in reading) == 1000
+    assert not any(servo.torque_on for servo in rig.table.telemetry().values())
+
+
+def test_a_wave_waits_for_its_start_and_swings_about_zero() -> None:
+    rig, _, _, plant = twin()
+    rig.begin()
+    rig.start([Move("x", 0.0, 50.0)])
+    rig.read(1.0)
+    began_s = plant.now_s
+    rig.start([Wave("x", (20.0, 2.0), (0.5, 2.0171), 4.0, start_s=1.0)])
+    read(rig, 110)
+    t = np.arange(0.0, 5.0, 0.01)
+    angle = plant.servos["x"].motion(began_s + t)[0]
+    assert np.abs(angle[t < 1.0]).max() < 0.3
+    meant = 20.0 * np.sin(np.pi * (t - 1.0)) + 2.0 * np.sin(2 * np.pi * 2.0171 * (t - 1.0))
+    assert np.abs(angle - meant)[t > 1.0].max() < 4.0
+    assert np.ptp(angle) > 36.0
 
 
 def test_rows_are_means_of_ten_samples_stamped_at_their_centre(rig: Rig) -> None:
@@ -234,8 +262,8 @@ def test_what_waited_while_nobody_read_comes_before_the_next_motion() -> None:
         def waiting(self) -> int:
             return 777
 
-    plant = Plant(1)
-    rig = Rig("twin:", TwinTable(plant), Slow(plant), simulated=True)
+    table = TwinTable(Plant(1))
+    rig = Rig("twin:", table, Slow(table), simulated=True)
     rig.begin()
     (block,) = rig.waiting()
     assert len(block.columns["time_s"]) == 77
@@ -253,10 +281,11 @@ def test_safe_tells_both_devices_though_the_first_fails() -> None:
         def safe(self) -> None:
             self.told = True
 
-    plant = Plant(1)
-    daq = Noting(plant)
+    table = Deaf(Plant(1))
+    daq = Noting(table)
+    rig = Rig("twin:", table, daq, simulated=True)
     with pytest.raises(DeviceError):
-        Rig("twin:", Deaf(plant), daq, simulated=True).safe()
+        rig.safe()
     assert daq.told
 
 

@@ -48,11 +48,10 @@ def _twin(url: str, rest: str) -> Rig:
             raise Problem("rig.option", name=name, given=text, allowed=EXAMPLE)
         numbers[name] = int(text)
     seed = numbers.get("seed", 1)
-    plant = Plant(seed, covariates=bool(numbers.get("covariates", 0)))
-    return Rig(
-        url,
-        TwinTable(plant),
-        TwinDaq(plant),
-        simulated=True,
-        mount=lambda board: plant.mount(board_truth(seed, board)),
-    )
+    table = TwinTable(Plant(seed, covariates=bool(numbers.get("covariates", 0))))
+
+    def mount(board: str) -> None:
+        with table.lock:
+            table.plant.mount(board_truth(seed, board))
+
+    return Rig(url, table, TwinDaq(table), simulated=True, mount=mount)

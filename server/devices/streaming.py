@@ -9,12 +9,12 @@ PERIOD_S = 0.02
 LEAD_S = 0.04
 
 
-def goal(motion: Motion, from_deg: float, time_s: float) -> tuple[float, float]:
-    """Goal (deg) and speed (deg/s) to command `time_s` after a step began with this axis at `from_deg`."""
+def goal(motion: Motion, time_s: float) -> tuple[float, float]:
+    """Goal (deg) and speed (deg/s) to command `time_s` after the step of this motion began."""
     if isinstance(motion, Move):
         return motion.to_deg, motion.rate_dps
-    ahead = motion.angle_deg(from_deg, time_s + LEAD_S)
-    return ahead, abs(ahead - motion.angle_deg(from_deg, time_s)) / LEAD_S
+    ahead = motion.angle_deg(0.0, time_s + LEAD_S)
+    return ahead, abs(ahead - motion.angle_deg(0.0, time_s)) / LEAD_S
 
 
 def times(motion: Motion) -> list[float]:

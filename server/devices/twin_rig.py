@@ -1,9 +1,11 @@
 """`twin:`, the simulated rig: a table and a DAQ in front of one `Plant`.
 
-Reading n samples is what makes time pass, so nothing waits and a test sleeps nowhere.
+Reading n samples is what makes time pass, so nothing waits and a test sleeps nowhere. One lock guards the plant,
+because an emergency stop comes from another thread than the one that reads.
 """
 
 from collections.abc import Mapping, Sequence
+from threading import Lock
 
 import numpy as np
 
@@ -18,7 +20,7 @@ class TwinTable:
     """Two simulated servos. `silent` axes do not answer, as with a pulled cable."""
 
     def __init__(self, plant: Plant) -> None:
-        self.plant = plant
+        self.plant, self.lock = plant, Lock()
         self.silent: set[str] = set()
         self.axes: Mapping[str, Axis] = {
             axis: Axis(axis, -150.0, 150.0, servo.spec.top_rate_dps, STEP_DEG, servo.spec.part, servo.spec.supply_V)
@@ -30,16 +32,16 @@ class TwinTable:
             raise DeviceError("rig.servo_silent", axis=axis, part=self.axes[axis].part)
 
     def start(self, motions: Sequence[Motion]) -> None:
-        now = self.plant.now_s
-        for motion in motions:
-            goals = ((now + t, *streaming.goal(motion, 0.0, t - motion.start_s)) for t in streaming.times(motion))
-            self.plant.servos[motion.axis].command(goals)
+        with self.lock:
+            now_s = self.plant.now_s
+            for motion in motions:
+                servo = self.plant.servos[motion.axis]
+                servo.command((now_s + t, *streaming.goal(motion, t)) for t in streaming.times(motion))
 
     def read(self) -> dict[str, Readings]:
-        read = {axis: Readings(*arrays) for axis, arrays in self.plant.encoders().items()}
-        for axis in self.silent:
-            read[axis] = Readings(np.empty(0), np.empty(0))
-        return read
+        with self.lock:
+            read = {axis: Readings(*arrays) for axis, arrays in self.plant.encoders().items()}
+        return read | {axis: Readings(np.empty(0), np.empty(0)) for axis in self.silent}
 
     def telemetry(self) -> dict[str, Telemetry]:
         return {
@@ -48,8 +50,9 @@ class TwinTable:
         }
 
     def safe(self) -> None:
-        for servo in self.plant.servos.values():
-            servo.stop(self.plant.now_s)
+        with self.lock:
+            for servo in self.plant.servos.values():
+                servo.stop(self.plant.now_s)
 
     def close(self) -> None:
         self.safe()
@@ -60,8 +63,9 @@ class TwinDaq:
 
     part = "NI USB-6008"
 
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
+    def __init__(self, table: TwinTable) -> None:
+        plant = self.plant = table.plant
+        self._lock = table.lock
         self.unplugged = False
         self.rate_hz = plant.daq.spec.rate_hz
         self.channel_delay_s = plant.daq.spec.channel_delay_s
@@ -73,7 +77,8 @@ class TwinDaq:
             raise DeviceError("rig.daq_silent", part=self.part)
 
     def start(self) -> None:
-        self.plant.daq.start(self.plant.now_s + 1.0 / self.rate_hz)
+        with self._lock:
+            self.plant.daq.start(self.plant.now_s + 1.0 / self.rate_hz)
 
     def waiting(self) -> int:
         return 0
@@ -81,7 +86,8 @@ class TwinDaq:
     def read(self, n: int) -> Samples:
         if self.unplugged:
             raise DeviceError("rig.daq_silent", part=self.part)
-        return self.plant.advance(n)
+        with self._lock:
+            return self.plant.advance(n)
 
     def safe(self) -> None:
         """Nothing runs between reads."""
