@@ -7,11 +7,15 @@ const TOKEN = "gyrobench.token";
 const LEASE = "gyrobench.lease";
 
 // `serve` on an open address prints http://…/#token=…; keep it, and keep it out of the address bar.
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) {
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!given) return false;
   localStorage.setItem(TOKEN, given);
   history.replaceState(null, "", location.pathname + location.search);
+  return true;
 }
+takeToken();
+addEventListener("hashchange", () => { if (takeToken()) location.reload(); });
 
 /** A refusal or a failure, with the server's sentence in the reader's language as its message. */
 export class Refused extends Error {
@@ -39,8 +43,10 @@ async function call(method, path, body) {
   }
   if (answer.status === 204) return null;
   const content = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Refused(content, answer.status);
-  return content;
+  if (answer.ok) return content;
+  const refused = new Refused(content, answer.status);
+  if (answer.status === 401) document.dispatchEvent(new CustomEvent("token-needed", { detail: refused }));
+  throw refused;
 }
 
 const query = (values) => {

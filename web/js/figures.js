@@ -6,6 +6,9 @@ import { fixed, t, withUncertainty } from "./text.js";
 let fields = null;
 export const loadFigures = async () => { fields ??= (await api.fields()).items; };
 
+/** The figure that a limit's path (`["rate", "nonlinearity_pct_fs"]`) is about. */
+export const figureAt = (path) => fields.find((field) => field.path.every((key, i) => key === path[i]));
+
 const at = (axis, path) => path.reduce((node, key) => node?.[key], axis);
 
 /** [{path, name, unit, text, value}] of one axis (CONTRACT 3 `axes`), or of one state's part of it with `under`. */

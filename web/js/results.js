@@ -1,8 +1,8 @@
 // A state's result as a table, beside the datasheet where the datasheet says something.
 
-import { h, table } from "./dom.js";
-import { figures } from "./figures.js";
-import { decimals, fixed, sentence, signed, t, withUncertainty } from "./text.js";
+import { facts, h, table } from "./dom.js";
+import { figureAt, figures } from "./figures.js";
+import { decimals, fixed, minus, plain, sentence, signed, t, withUncertainty } from "./text.js";
 
 export const UNIT = { rate: "deg/s", position: "deg" };
 export const split = (state) => state.split("_");
@@ -14,6 +14,9 @@ const PARAMETERS = [["bias_V", "figure.bias", "V", 1], ["scale_factor_V_per_dps"
 /** How far the datasheet's value is from the measured one, in per cent of the datasheet's. */
 const difference = (measured, datasheet) => (datasheet ? (100 * (measured - datasheet)) / datasheet : null);
 
+/** What stands beside the certified values: the adaptive estimate, or in profile thesis, where that is certified, the fit. */
+const beside = (result) => result.integral_fit ?? result.adaptive;
+
 function estimateRows(result) {
   return PARAMETERS.map(([key, name, unit, factor]) => {
     const { value, standard_uncertainty: u, expanded_uncertainty: expanded } = result[key];
@@ -23,7 +26,7 @@ function estimateRows(result) {
       `${t(name)}, ${unit}`,
       { n: withUncertainty(value * factor, u * factor) },
       { n: expanded == null ? "–" : `± ${fixed(expanded * factor, decimals(expanded * factor) ?? 4)}` },
-      { n: result.adaptive ? fixed(result.adaptive[key] * factor, 4) : "–" },
+      { n: fixed(beside(result)[key] * factor, 4) },
       { n: printed == null ? "–" : fixed(printed * factor, 2) },
       { n: percent == null ? "–" : `${signed(percent, 1)} %` },
     ];
@@ -40,16 +43,49 @@ export function estimateSummary(axis, result) {
   ];
 }
 
-const ESTIMATE_HEAD = () => [t("result.parameter"), ...["certified", "expanded", "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
+const estimateHead = (result) => [t("result.parameter"),
+  ...["certified", "expanded", result.integral_fit ? "integral" : "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
+
+/** What else the estimate state found: the motion's delay, the filter in use and whether it suits, the rig's step. */
+function conditions({ delay_s: delay, noise, kalman, step_check: step }) {
+  const ms = (value) => value * 1e3;
+  return facts([
+    [t("figure.delay"), delay?.value == null ? null : `${withUncertainty(ms(delay.value), ms(delay.standard_uncertainty))} ms`],
+    [t("result.noise"), noise ? `${fixed(noise.white_dps, 3)} deg/s` : null],
+    [t("result.gain"), kalman ? `K₁ ${fixed(kalman.k1, 1)}, K₂ ${fixed(kalman.k2, 2)}` : null],
+    [t("result.noise_ratio"), kalman?.noise_ratio == null ? null : fixed(kalman.noise_ratio, 2)],
+    [t("result.whiteness"), kalman?.whiteness_p == null ? null : kalman.whiteness_p < 0.001 ? "p < 0.001" : `p = ${fixed(kalman.whiteness_p, 3)}`],
+    [t("result.filterpy"), kalman?.filterpy_difference == null ? null : `${minus(kalman.filterpy_difference.toExponential(1))} V`],
+    [t("figure.step_rate_error"), step ? `${fixed(step.rate_error_pct, 2)} %` : null],
+    [t("figure.step_position_error"), step ? `${fixed(step.position_error_pct, 2)} %` : null],
+  ], true);
+}
+
+/** Where the uncertainty of the two parameters comes from, and what is not in it. */
+export function budgetTable(budget) {
+  const rows = Object.entries(budget).flatMap(([key, lines]) => lines.map((line) => [
+    `${t(`figure.${key}`)}: ${t(`budget.${line.name}`)}`, line.kind ?? "",
+    { n: line.excluded ? t("result.excluded") : (key === "bias" ? `${fixed(line.standard_uncertainty * 1e6, 2)} µV` : `${fixed(line.standard_uncertainty * 1e6, 3)} µV/(deg/s)`) },
+    { n: line.excluded ? "" : line.dof == null ? "∞" : fixed(line.dof, 0) },
+  ]));
+  return table([t("result.source"), t("result.type"), { n: t("result.standard_uncertainty") }, { n: t("result.dof") }], rows, { compact: true, cards: true, label: t("result.budget") });
+}
+
+/** Each limit of a specification and whether it is met; nothing without a specification. */
+export function limitsCard(certificate) {
+  if (!certificate?.judgement?.length) return null;
+  const row = ({ axis, path, min, max, value, ok }) => {
+    const { text, unit, factor } = figureAt(path);
+    const number = (x) => ({ n: x == null ? "" : plain(x * factor) });
+    return [`${axis} ${t(text)}, ${unit}`, number(value), number(min), number(max), ok ? t("certificate.limits.ok") : h("strong", { class: "failed" }, t("certificate.limits.not_ok"))];
+  };
+  return h("section", { class: "panel stack wide" },
+    h("h2", {}, t("certificate.spec", { name: certificate.spec.name ?? "" })),
+    table([t("certificate.limits.figure"), { n: t("certificate.limits.value") }, { n: t("result.lowest") }, { n: t("result.highest") }, t("certificate.limits.outcome")],
+      certificate.judgement.map(row), { compact: true, cards: true, label: t("certificate.spec", { name: certificate.spec.name ?? "" }) }));
+}
 
 export const warnings = (list) => (list ?? []).map((warning) => h("p", { class: "notice small" }, sentence(warning)));
-
-function sampleSize(size, unit) {
-  if (!size) return null;
-  const key = size.enough ? "result.enough" : "result.not_enough";
-  return h("p", { class: size.enough ? "small muted" : "notice small" },
-    t(key, { used: size.used, needed: Math.ceil(size.needed), d: size.d ?? size.ci / 2, unit }));
-}
 
 /** The card of one state: its figures, what they mean, and the door to do it again. */
 export function resultCard(state, result, { actions = [], level = "h2" } = {}) {
@@ -58,10 +94,12 @@ export function resultCard(state, result, { actions = [], level = "h2" } = {}) {
   return h("section", { class: `panel stack ${isEstimate ? "wide" : "test"}`, id: `result-${state}` },
     h("div", { class: "row spread" }, h(level, {}, stateName(state)), ...actions),
     isEstimate
-      ? table(ESTIMATE_HEAD(), estimateRows(result), { label: stateName(state), cards: true })
+      ? table(estimateHead(result), estimateRows(result), { label: stateName(state), cards: true })
       : table([t("result.figure"), { n: t("result.value") }],
         figures({ [kind]: result }, kind).map((row) => [`${row.name}, ${row.unit}`, { n: row.text }]), { compact: true, label: stateName(state) }),
-    isEstimate ? null : sampleSize(result.sample_size, UNIT[kind]),
+    isEstimate ? conditions(result) : null,
+    // Too few readings are among the warnings.
+    result.sample_size?.enough ? h("p", { class: "small muted" }, sentence(result.sample_size)) : null,
     ...warnings(result.warnings));
 }
 
@@ -75,8 +113,9 @@ export function linearityTable(rows, kind) {
 /** Thesis 5.7 to 5.10 and 5.15 to 5.18; readings that were dropped as extremes are struck through. */
 export function repeatTable(rows, kind) {
   const keys = ["encoder", "mean", "standard_deviation", "bias_error", "random_error"];
-  return table([t("table.set_point"), ...keys.map((key) => ({ n: t(`table.${key}`) }))].map(withUnit(kind)),
-    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.standard_deviation, row.bias_error, row.random_error].map((value) => ({ n: fixed(value, 4) }))]),
+  const readings = (row) => h("span", { class: "readings" }, row.readings.flatMap((value, i) => [h(row.used[i] ? "span" : "s", {}, fixed(value, 3)), " "]));
+  return table([...[t("table.set_point"), ...keys.map((key) => ({ n: t(`table.${key}`) }))].map(withUnit(kind)), t("table.readings")],
+    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.standard_deviation, row.bias_error, row.random_error].map((value) => ({ n: fixed(value, 4) })), readings(row)]),
     { compact: true, label: t("table.repeat") });
 }
 

@@ -28,15 +28,14 @@ function stopButton() {
 /** A sentence about the whole page, under the bar, until another with the same name or null replaces it. */
 export function notice(name, text, kind = "") {
   $(`#notices [data-name="${name}"]`)?.remove();
-  if (text) $("#notices").append(h("p", { class: `notice ${kind}`, "data-name": name, role: kind === "fail" ? "alert" : "status" }, text));
+  if (text) $("#notices").append(h("div", { class: `notice ${kind}`, "data-name": name, role: kind === "fail" ? "alert" : "status" }, text));
 }
 
-/** A problem of the whole page; where the server asks for its token, the place to type it. */
-export function fault(problem) {
-  notice("fault", problem.message ?? String(problem), "fail");
-  if (problem.status !== 401) return;
+/** The server asks for its token: its sentence, and the place to type it. */
+function askToken(problem) {
+  notice("token", problem.message, "fail");
   const field = h("input", { type: "password", "aria-label": t("page.token"), autocomplete: "off" });
-  $('#notices [data-name="fault"]').append(h("form", {
+  $('#notices [data-name="token"]').append(h("form", {
     class: "row",
     onsubmit: (event) => { event.preventDefault(); api.useToken(field.value.trim()); location.reload(); },
   }, field, h("button", { type: "submit" }, t("page.use_token"))));
@@ -97,11 +96,12 @@ export async function page(name, work) {
     }
   }
   document.addEventListener("rig-asked", lookAtRig);
+  document.addEventListener("token-needed", ({ detail }) => askToken(detail));
   setInterval(() => { if (!document.hidden || api.holdsRig()) lookAtRig(); }, RIG_EVERY_MS);
   try {
     await Promise.all([work(main), lookAtRig()]);
   } catch (problem) {
-    fault(problem);
-    if (!problem.status) throw problem;
+    notice("fault", problem.message, "fail");
+    if (problem.status === undefined) throw problem;
   }
 }

@@ -52,7 +52,7 @@ export function translate(root = document) {
   }
 }
 
-const minus = (text) => text.replace("-", "−");
+export const minus = (text) => text.replace("-", "−");
 
 export const fixed = (value, digits) =>
   value == null || !Number.isFinite(value) ? "–" : minus(value.toFixed(digits)).replace(/^−(0(\.0*)?)$/, "$1");

@@ -33,9 +33,9 @@ async function showBoard(main, id) {
     h("section", { class: "panel stack" }, h("h2", {}, t("boards.certificates")), certificates.length
       ? table([t("certificates.number"), t("certificates.verdict"), t("certificates.issued"), t("certificates.documents")], certificates.map(certificateCells), { label: t("boards.certificates"), cards: true })
       : h("p", { class: "muted" }, t("boards.no_certificate"))),
-    h("section", { class: "panel stack" }, h("h2", {}, t("boards.runs")), runs.length
+    h("section", { class: "panel stack" }, h("h2", {}, t("run.runs")), runs.length
       ? table([t("run.started"), t("run.status"), t("setup.profile"), t("run.certificate")], runs.map((run) => [
-        h("a", { href: links.run(run.id) }, when(run.created_at)), t(`run.status_${run.status}`), t(`profile.${run.profile}`), run.certificate ?? ""]), { label: t("boards.runs"), cards: true })
+        h("a", { href: links.run(run.id) }, when(run.created_at)), t(`run.status_${run.status}`), t(`profile.${run.profile}`), run.certificate ?? ""]), { label: t("run.runs"), cards: true })
       : h("p", { class: "muted" }, t("boards.no_run"))),
     h("p", { class: "row" }, h("a", { class: "button", href: links.compare(board.id, "") }, t("boards.compare"))),
   );

@@ -5,7 +5,7 @@ import { $, facts, h, say } from "../dom.js";
 import { loadFigures } from "../figures.js";
 import { watch } from "../live.js";
 import { livePlots } from "../plots.js";
-import { estimateSummary, resultCard, split, stateName } from "../results.js";
+import { estimateSummary, limitsCard, resultCard, split, stateName } from "../results.js";
 import { Setup } from "../setup.js";
 import { notice, page, speedWord } from "../shell.js";
 import { STATES, showStates } from "../states.js";
@@ -186,6 +186,7 @@ async function end(id) {
   }
   const number = run.certificate;
   const certificate = number ? await api.certificate(number).catch(() => null) : null;
+  $("#results").prepend(...[limitsCard(certificate)].filter(Boolean));
   $("#headline").textContent = number ? t(`calibrate.certificate_${certificate?.verdict ?? "issued"}`, { board: run.board, number }) : t(`calibrate.${run.status}`, { board: run.board });
   $("#next").textContent = run.message ? sentence(run.message) : t(number ? "calibrate.certificate_next" : "calibrate.ended_next");
   const documents = number ? ["pdf", "csv", "json"].map((kind, i) => h("a", { class: `button ${i ? "" : "main"}`, href: links.document(number, kind), download: "" }, t(`document.${kind}`))) : [];

@@ -9,8 +9,9 @@ import { t, when } from "../text.js";
 page("compare", async (main) => {
   const asked = new URLSearchParams(location.search);
   const known = (await api.boards({ limit: 200 })).items;
+  const certified = known.filter((board) => board.certificates);
   const [a, b] = ["a", "b"].map((name, i) => h("input", {
-    id: name, name, list: "known", autocomplete: "off", spellcheck: "false", required: true, value: asked.get(name) || known[i]?.id || "",
+    id: name, name, list: "known", autocomplete: "off", spellcheck: "false", required: true, value: asked.get(name) || certified[i]?.id || "",
   }));
   const error = h("p", { class: "error", role: "alert" });
   const result = h("section", { class: "stack" });
@@ -33,7 +34,7 @@ page("compare", async (main) => {
   }
   form.addEventListener("submit", (event) => { event.preventDefault(); show(); });
   await loadFigures();
-  if (known.length < 2 && !asked.get("b")) result.append(h("p", { class: "empty" }, t("compare.empty")));
+  if (certified.length < 2 && !asked.get("b")) result.append(h("p", { class: "empty" }, t("compare.empty")));
   else await show();
 });
 

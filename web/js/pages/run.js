@@ -5,7 +5,7 @@ import { chart } from "../chart.js";
 import { loadFigures } from "../figures.js";
 import { facts, h, say, table } from "../dom.js";
 import { testCharts } from "../plots.js";
-import { linearityTable, repeatTable, resultCard, split, stateName } from "../results.js";
+import { budgetTable, limitsCard, linearityTable, repeatTable, resultCard, split, stateName } from "../results.js";
 import { page } from "../shell.js";
 import { showStates } from "../states.js";
 import { duration, fixed, sentence, t, when } from "../text.js";
@@ -14,7 +14,7 @@ page("run", async (main) => {
   const id = new URLSearchParams(location.search).get("id");
   if (!id) return showRuns(main);
   const [run] = await Promise.all([api.run(id), loadFigures()]);
-  return showRun(main, run);
+  return showRun(main, run, run.certificate ? await api.certificate(run.certificate) : null);
 });
 
 async function showRuns(main) {
@@ -30,7 +30,7 @@ async function showRuns(main) {
   });
 }
 
-function showRun(main, run) {
+function showRun(main, run, certificate) {
   document.title = `${run.board} · Gyrobench`;
   const error = h("p", { class: "error", role: "alert" });
   const states = h("ol", { class: "states" });
@@ -69,6 +69,7 @@ function showRun(main, run) {
         run.certificate ? null : certify),
       error),
     states,
+    ...[limitsCard(certificate)].filter(Boolean),
   );
   showStates(states, run.states);
 
@@ -77,7 +78,10 @@ function showRun(main, run) {
     const [kind, axis] = split(name);
     const card = resultCard(name, result, { actions: [repeat(name)] });
     main.append(card);
-    if (kind === "estimate") comparison(card, run, axis);
+    if (kind === "estimate") {
+      if (result.budget) card.append(h("details", {}, h("summary", {}, t("result.budget")), budgetTable(result.budget)));
+      comparison(card, run, axis);
+    }
     else test(card, kind, result);
   }
   const missing = run.states.filter(({ name }) => !results[name]);
