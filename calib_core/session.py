@@ -31,8 +31,8 @@ LEAST_ANSWER = 0.1
 """A scale factor below this part of the datasheet's is a gyro that is not connected, not a bad one."""
 # Real, and of unknown size on a rig without calibration records of its own: named, never guessed.
 EXCLUDED = {
-    "bias": ("daq_gain_offset", "temperature"),
-    "scale_factor": ("encoder_scale", "daq_gain_offset", "alignment", "temperature"),
+    "bias_V": ("daq_gain_offset", "temperature"),
+    "scale_factor_V_per_dps": ("encoder_scale", "daq_gain_offset", "alignment", "temperature"),
 }
 Result = dict[str, Any]
 
@@ -174,13 +174,12 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
     whole, motion = motion_of(recording, axis)
     fit = integral_fit.fit(whole, axis)
     _check_answer(fit, axis, gyro_model)
-    hold = whole.gyro(axis).values[: len(whole) - len(motion)]
-    interval_s = float(np.median(np.diff(motion.time_s)))
-    moving_density = kalman.noise_density(motion.gyro(axis).values, interval_s)
-    rested = np.isfinite(hold).sum() > LEAST_REST
-    rest_density = kalman.noise_density(hold, interval_s) if rested else moving_density
     datasheet = gyro_model.axes[axis]
+    interval_s = float(np.median(np.diff(motion.time_s)))
     v = motion.gyro(axis)
+    moving = kalman.noise_density(v.values, interval_s)
+    hold = whole.gyro(axis).values[: len(whole) - len(motion)]
+    rest = kalman.noise_density(hold, interval_s) if np.isfinite(hold).sum() > LEAST_REST else moving
     adaptive = adaptation.estimate(
         motion.time_s + v.delay_s,
         v.values,
@@ -188,27 +187,25 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
         form="thesis" if profile == "thesis" else "matched",
         frequency_hz=PROFILES[profile].sine_hz,
         start=(datasheet.bias_V, datasheet.scale_factor_V_per_dps),
-        rest_density=rest_density,
+        rest_density=rest or moving,
     )
-    difference = kalman.filterpy_difference(v.values[:1000], interval_s, adaptive.gain)
-    budgets = _budgets(fit, adaptive, profile)
-    warnings = [dict(warning) for warning in fit.warnings]
-    warnings += _filter_warnings(difference, moving_density / rest_density)
+    difference_V = kalman.filterpy_difference(v.values[:1000], interval_s, adaptive.gain)
+    bias, scale_factor = _budgets(fit, adaptive, profile)
+    step, warnings = _step_check(recording, axis, profile, gyro_model)
+    warnings += [dict(warning) for warning in fit.warnings]
+    if not difference_V <= FILTERPY_LIMIT_V:
+        values = {"difference_V": difference_V, "limit_V": FILTERPY_LIMIT_V}
+        warnings.append({"code": "session.filterpy", "values": values})
+    if moving > NOISE_GREW * rest > 0:
+        warnings.append({"code": "session.noise_grew", "values": {"ratio": moving / rest}})
     if fit.scale_factor * datasheet.scale_factor_V_per_dps < 0:
         warnings.append({"code": "session.reversed", "values": {"axis": axis}})
-    ranges = _ranges(recording, axis, gyro_model)
-    step_dps = PROFILES[profile].step_dps * ranges.rate_dps / Ranges().rate_dps
-    try:
-        step = rig_check.step(recording, axis, ranges.position_deg, min(step_dps, datasheet.range_dps))
-    except Problem as problem:  # the table's own check says nothing about the gyro
-        step = None
-        warnings.append({"code": problem.code, "values": problem.values})
     return _document(
         {
             "state": f"estimate_{axis}",
             "axis": axis,
-            "bias_V": _measured(budgets["bias"]),
-            "scale_factor_V_per_dps": _measured(budgets["scale_factor"]),
+            "bias_V": _measured(bias),
+            "scale_factor_V_per_dps": _measured(scale_factor),
             "adaptive": {
                 "bias_V": adaptive.bias_V,
                 "scale_factor_V_per_dps": adaptive.scale_factor_V_per_dps,
@@ -218,11 +215,8 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
             "datasheet": {
                 "bias_V": datasheet.bias_V,
                 "scale_factor_V_per_dps": datasheet.scale_factor_V_per_dps,
-                "bias_difference_pct": 100 * (budgets["bias"].value / datasheet.bias_V - 1)
-                if datasheet.bias_V
-                else None,
-                "scale_factor_difference_pct": 100
-                * (budgets["scale_factor"].value / datasheet.scale_factor_V_per_dps - 1),
+                "bias_difference_pct": _difference_pct(bias.value, datasheet.bias_V),
+                "scale_factor_difference_pct": _difference_pct(scale_factor.value, datasheet.scale_factor_V_per_dps),
             },
             "delay_s": _delay(fit),
             "noise": {name: fit.noise[name] for name in ("white_dps", "correlation_time_s")},
@@ -231,11 +225,12 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
                 "k1": adaptive.gain.k1,
                 "k2": adaptive.gain.k2,
                 "whiteness_p": adaptive.whiteness.p,
-                "noise_ratio": moving_density / rest_density,
-                "filterpy_difference": difference,
+                "noise_ratio": moving / rest if rest else None,
+                "variance_ratio": adaptive.whiteness.variance_ratio,
+                "filterpy_difference": difference_V,
             },
-            "step_check": step and step.to_json(),
-            "budget": {name: budget.to_json() for name, budget in budgets.items()},
+            "step_check": step,
+            "budget": {"bias": bias.to_json(), "scale_factor": scale_factor.to_json()},
             "warnings": warnings,
         }
     )
@@ -259,22 +254,38 @@ def _check_answer(fit: integral_fit.Fit, axis: str, gyro_model: GyroModel) -> No
         raise Problem("session.no_answer", axis=axis, found=1e3 * found, datasheet=1e3 * promised)
 
 
-def _budgets(fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str) -> dict[str, Budget]:
+def _budgets(fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str) -> tuple[Budget, Budget]:
     """GUM budgets of the certified bias and scale factor.
 
     The thesis' estimator is certified as it is; what it is off by, seen beside the integral fit of the same rows, is
     its uncertainty (a known bias that is not corrected, GUM F.2.4.5).
     """
-    budgets = {}
-    chosen = {"bias": (fit.bias, adaptive.bias_V), "scale_factor": (fit.scale_factor, adaptive.scale_factor_V_per_dps)}
-    for (name, (fitted, adapted)), parameter in zip(chosen.items(), fit.names, strict=True):
-        sources = [Contribution("fit", fit.standard_uncertainty(parameter), "A", dof=fit.dof[parameter])]
-        if name == "scale_factor":
-            sources.append(Contribution("clock", CLOCK_ERROR, distribution="uniform", sensitivity=fitted))
-        if profile == "thesis":
-            sources.append(Contribution("estimator", abs(adapted - fitted)))
-        budgets[name] = Budget(adapted if profile == "thesis" else fitted, tuple(sources), EXCLUDED[name])
-    return budgets
+
+    def budget(name: str, fitted: float, adapted: float, *more: Contribution) -> Budget:
+        sources = (Contribution("fit", fit.standard_uncertainty(name), "A", dof=fit.dof[name]), *more)
+        excluded = EXCLUDED[name]
+        if profile != "thesis":
+            return Budget(fitted, sources, excluded)
+        return Budget(adapted, (*sources, Contribution("estimator", abs(adapted - fitted))), excluded)
+
+    clock = Contribution("clock", CLOCK_ERROR, distribution="uniform", sensitivity=fit.scale_factor)
+    return (
+        budget("bias_V", fit.bias, adaptive.bias_V),
+        budget("scale_factor_V_per_dps", fit.scale_factor, adaptive.scale_factor_V_per_dps, clock),
+    )
+
+
+def _step_check(
+    recording: Recording, axis: str, profile: str, gyro_model: GyroModel
+) -> tuple[Result | None, list[Result]]:
+    """The table's own check, where the recording has it. It says nothing about the gyro, so it only warns."""
+    ranges = _ranges(recording, axis, gyro_model)
+    asked_dps = PROFILES[profile].step_dps * ranges.rate_dps / Ranges().rate_dps
+    try:
+        step = rig_check.step(recording, axis, ranges.position_deg, min(asked_dps, gyro_model.axes[axis].range_dps))
+    except Problem as problem:
+        return None, [{"code": problem.code, "values": problem.values}]
+    return dict(step.to_json()) if step else None, []
 
 
 def _measured(budget: Budget) -> Result:
@@ -293,13 +304,8 @@ def _delay(fit: integral_fit.Fit) -> Result | None:
     return {"value": fit.delay_s, "standard_uncertainty": u, "expanded_uncertainty": 1.96 * u}
 
 
-def _filter_warnings(difference_V: float, noise_ratio: float) -> list[Result]:
-    told: list[Result] = []
-    if not difference_V <= FILTERPY_LIMIT_V:
-        told.append({"code": "session.filterpy", "values": {"difference_V": difference_V, "limit_V": FILTERPY_LIMIT_V}})
-    if noise_ratio > NOISE_GREW:
-        told.append({"code": "session.noise_grew", "values": {"ratio": noise_ratio}})
-    return told
+def _difference_pct(value: float, promised: float) -> float | None:
+    return 100.0 * (value / promised - 1.0) if promised else None
 
 
 # --- odds and ends -------------------------------------------------------------------------------------------------
