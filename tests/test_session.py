@@ -10,8 +10,10 @@ from sessions import BOARD, SEED, session_recording
 from calib_core import comparison, session
 from calib_core.problem import Problem
 from calib_core.recording import Recording
-from calib_core.sequence import STATES
+from calib_core.sequence import STATES, make_plan
 from calib_core.twin import board_truth
+from server.devices import open_rig
+from server.engine import record
 
 TEST_FIGURES = ("nonlinearity_pct_fs", "repeatability_pct_fs")
 UNIT_FIGURES = (
@@ -176,3 +178,15 @@ def test_estimated_parameters_follow_the_encoder_where_the_datasheets_do_not() -
     assert found["estimated"]["angle_rms_deg"] < 0.3 < 5 < found["datasheet"]["angle_rms_deg"]
     assert found["estimated"]["rate_rms_dps"] < 0.8 < 5 < found["datasheet"]["rate_rms_dps"]
     json.dumps(found, allow_nan=False)
+
+
+def test_the_step_is_held_against_the_speed_and_angle_that_the_plan_asked_for() -> None:
+    for rate_dps, asked in ((50.0, 30.0), (110.0, 60.0)):
+        plan = make_plan(seed=1, states=("estimate_x",), ranges={"x": {"rate_dps": rate_dps, "position_deg": 90.0}})
+        [step] = [step for step in plan.states[0].steps if step.segment == "step_x"]
+        [move] = step.motions
+        ranges = {"x": {"rate_dps": rate_dps, "position_deg": 90.0, "sine_deg": 30.0}}
+        recording = record(plan, open_rig("twin:?seed=1"), header={"ranges": json.dumps(ranges)})
+        check = session.analyse(recording).states["estimate_x"]["step_check"]
+        assert (check["rate_dps"], check["to_deg"]) == (move.rate_dps, move.to_deg) == (asked, 90.0)
+        assert check["rate_error_pct"] < 4
