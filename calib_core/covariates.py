@@ -1,0 +1,113 @@
+"""The best estimate, from a recording, of what effects depend on: rate, angle, direction, temperature …
+
+The argument of every φ(ω) is a rate that is exactly zero in rests, whose slow part comes from the encoder and whose
+fast part comes from the gyro. With the gyro's rate alone a column would contain the gyro's own noise, which is what the
+residual is made of: a spline in rate then "explains" a healthy record at thirty standard deviations.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core.effects.base import Covariates
+from calib_core.integral_fit import Design
+from calib_core.recording import Recording
+
+F64 = NDArray[np.float64]
+
+CROSSOVER_S = 0.15
+"""Below this time scale the gyro leads, above it the encoder."""
+TURNING_DPS = 1.5
+"""Rates above this give a direction; slower ones keep the last."""
+COVARIATE_S = 0.5
+"""Temperature and supply are smoothed over this: they change slowly, their converters do not know that."""
+
+
+def of(recording: Recording, axis: str, design: Design, bias: float, scale_factor: float) -> Covariates:
+    """Covariates (k,) at the gyro's samples of ``design``, given the output's bias and scale factor."""
+    s = design.averages.samples
+    interval = s.interval_s
+    felt = (s.output - bias) / scale_factor if np.isfinite(scale_factor) else np.zeros_like(s.output)
+    other = next((a for a in ("x", "z", "y") if a != axis and f"{a}_position_deg" in recording.columns), None)
+    if design.reference == "encoder":
+        angle = _angle(recording, axis, s.time_s)
+        slow = CROSSOVER_S / interval
+        rate = felt - _smooth(felt, slow) + np.gradient(_smooth(angle, slow), interval)
+        rate = np.convolve(np.pad(rate, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        position = np.cumsum(felt) * interval
+        position += _smooth(angle - position, slow)
+        still = design.averages.at[design.averages.at >= 0]
+        rate[still] = 0.0
+        turning = rate
+    else:
+        reference = recording.reference_rate(axis)
+        assert reference is not None
+        rate = turning = np.nan_to_num(reference[s.index])
+        has_angle = f"{axis}_position_deg" in recording.columns
+        position = _angle(recording, axis, s.time_s) if has_angle else np.cumsum(rate) * interval
+    tilt = None
+    if f"{axis}_position_deg" in recording.columns or other == "x":
+        tilt = position if axis == "x" else (_angle(recording, "x", s.time_s) if other == "x" else None)
+    other_rate = None
+    if other is not None:
+        other_rate = np.gradient(_smooth(_angle(recording, other, s.time_s), 0.05 / interval), interval)
+    force = {
+        a: np.nan_to_num(recording.columns[f"{a}_acceleration_g"][s.index])
+        for a in "xyz"
+        if f"{a}_acceleration_g" in recording.columns
+    }
+    temperature = _slow(recording, "temperature_c", s.index, interval)
+    supply = _slow(recording, "supply_v", s.index, interval)
+    reference_values = {
+        name: float(values.mean())
+        for name, values in (("temperature_c", temperature), ("supply_v", supply))
+        if values is not None
+    }
+    return Covariates(
+        axis=axis,
+        time_s=s.time_s - s.time_s[0],
+        rate_dps=rate,
+        position_deg=position,
+        acceleration_dps2=np.gradient(rate, interval),
+        direction=direction(turning),
+        interval_s=interval,
+        temperature_c=temperature,
+        supply_v=supply,
+        other_rate_dps=other_rate,
+        tilt_deg=tilt,
+        specific_force_g=force or None,
+        reference=reference_values,
+    )
+
+
+def direction(rate_dps: F64) -> F64:
+    """(n,) sign of the last rotation faster than ``TURNING_DPS``; 0 before the first."""
+    sign = np.where(rate_dps > TURNING_DPS, 1.0, np.where(rate_dps < -TURNING_DPS, -1.0, 0.0))
+    turned = np.flatnonzero(sign)
+    if len(turned) == 0:
+        return sign
+    last = np.searchsorted(turned, np.arange(len(sign)), side="right") - 1
+    return np.where(last >= 0, sign[turned[np.maximum(last, 0)]], 0.0)
+
+
+def _angle(recording: Recording, axis: str, at_s: F64) -> F64:
+    time, angle = recording.position(axis)
+    return np.interp(at_s, time, angle)
+
+
+def _slow(recording: Recording, name: str, index: NDArray[np.int64], interval_s: float) -> F64 | None:
+    if name not in recording.columns:
+        return None
+    values = recording.columns[name][index]
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < 2:
+        return None
+    return _smooth(np.interp(np.arange(len(values)), known, values[known]), COVARIATE_S / interval_s)
+
+
+def _smooth(values: F64, sigma: float) -> F64:
+    """Gaussian mean, ``sigma`` in samples; ends are held."""
+    if sigma < 0.3:
+        return values
+    from scipy.ndimage import gaussian_filter1d
+
+    return np.asarray(gaussian_filter1d(values, sigma, mode="nearest", truncate=4.0))

@@ -1,0 +1,22 @@
+"""The zero depends on which way the gyro turned last."""
+
+from calib_core.effects.base import F64, Acts, Covariates, Effect, Param, Stage
+
+
+class Hysteresis(Effect):
+    """The zero depends on which way the gyro turned last.
+
+    Equation:      V += h sign(last rotation)
+    Cause:         friction and stress left behind in package and mounting
+    Signature:     residual at rest takes one of two levels
+    Confused with: backlash, dead_band
+    Excite it:     reversals, with rests after both directions
+    Source:        IEEE Std 528, hysteresis error
+    """
+
+    name, stage, acts, needs = "hysteresis", Stage.SENSOR, Acts.OUTPUT, ()
+    h = Param("{out}", 6e-4, (-0.1, 0.1))
+
+    @classmethod
+    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
+        return {"h": c.direction}

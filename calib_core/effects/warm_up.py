@@ -1,0 +1,25 @@
+"""The bias settles after switching on."""
+
+import numpy as np
+
+from calib_core.effects.base import F64, Acts, Covariates, Effect, Param, Stage
+
+
+class WarmUp(Effect):
+    """The bias settles after switching on.
+
+    Equation:      V += a exp(-t / tau)
+    Cause:         the part heats itself until it is in balance with its surroundings
+    Signature:     residual starts away from zero and dies out, at any rate
+    Confused with: bias_drift, bias_temperature
+    Excite it:     a cold start, held still
+    Source:        IEEE Std 528, warm-up time
+    """
+
+    name, stage, acts, needs = "warm_up", Stage.ELECTRICS, Acts.OUTPUT, ()
+    a = Param("{out}", 4.5e-3, (-0.5, 0.5))
+    tau = Param("s", 40.0, (3.0, 2000.0), grid=(8.0, 16.0, 32.0, 64.0, 128.0, 256.0), log=True)
+
+    @classmethod
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
+        return {"a": np.exp(-c.time_s / nonlinear["tau"])}
