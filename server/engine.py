@@ -40,7 +40,7 @@ class Abort(Protocol):
 
 
 class Pacer:
-    """Lets bench time go `speed` times as fast as the clock; infinity waits for nothing, as does hardware at 1."""
+    """Lets bench time go at most `speed` times as fast as the clock; infinity never waits, hardware paces itself."""
 
     def __init__(self, speed: float = math.inf, clock: Callable[[], float] = time.monotonic) -> None:
         if not speed > 0.0:
@@ -67,7 +67,7 @@ class Pacer:
 
 @dataclass(frozen=True, kw_only=True)
 class Document:
-    """What all documents say: which run, the how-manieth, and when (Unix time)."""
+    """What all documents say: which run, its number in the run from 0, and when (Unix time)."""
 
     run: str
     seq: int
@@ -184,11 +184,13 @@ def _run(
     def stamp() -> dict[str, Any]:
         return {"run": run_id, "seq": next(numbers), "time": clock()}
 
+    stopped: dict[str, Any] = {"status": "stopped", "code": "run.stopped"}
     outcome: dict[str, Any] = {"status": "finished"}
     try:
         yield Start(**stamp(), plan=plan.to_json(), seed=plan.seed, duration_s=plan.duration_s)
-        rig.mount(board)
+        rig.mount(board, plan.gyro_model)
         rig.begin()
+        sequence.check(plan, rig.axes)  # again: an open rig knows its supply and so its top speed
         described = {**_header(plan, board), **rig.header, **header}
         yield Descriptor(**stamp(), columns=rig.columns, rate_hz=1.0 / ROW_S, header=described)
         before_s = 0.0
@@ -222,21 +224,25 @@ def _run(
             before_s += state.duration_s
             yield StateEnd(**stamp(), state=state.name, index=index)
     except Aborted:
-        outcome = {"status": "stopped", "code": "run.stopped"}
+        outcome = stopped
     except Problem as problem:
-        outcome = {"status": "failed", "code": problem.code, "values": problem.values}
+        # An emergency stop takes the devices away from under a read: that is no fault of theirs.
+        outcome = stopped if abort.is_set() else _failed(problem.code, **problem.values)
     except Exception as error:
         log.exception("run %s failed", run_id)
-        outcome = {"status": "failed", "code": "internal",
-                   "values": {"kind": type(error).__name__, "detail": str(error)}}  # fmt: skip
+        outcome = _failed("internal", kind=type(error).__name__, detail=str(error))
     finally:
         # Also when the consumer closes the generator; then nothing may be yielded any more.
         try:
             rig.safe()
         except Exception as error:
             log.exception("run %s: the rig could not be made safe", run_id)
-            outcome = {"status": "failed", "code": "rig.not_safe", "values": {"reason": str(error)}}
+            outcome = _failed("rig.not_safe", reason=str(error))
     yield Stop(**stamp(), **outcome)
+
+
+def _failed(code: str, /, **values: object) -> dict[str, Any]:
+    return {"status": "failed", "code": code, "values": values}
 
 
 def _blocks(duration_s: float, block_s: float) -> Iterator[float]:

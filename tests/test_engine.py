@@ -126,6 +126,21 @@ def test_stop_in_every_state_takes_one_block_and_leaves_the_motors_off(state: st
     assert rig.at_rest
 
 
+def test_an_emergency_stop_under_a_read_is_a_stop_and_no_fault() -> None:
+    rig, abort, documents = Watched(), Event(), []
+    source = run(short("rate_x"), rig, abort=abort)
+    until(documents, source, moving_in("rate_x"))
+
+    def taken_away(n: int) -> None:
+        abort.set()
+        raise DeviceError("rig.daq_silent", part="NI USB-6008", asked=n)
+
+    rig.twin_daq.read = taken_away  # type: ignore[method-assign, assignment]
+    *_, stop = source
+    assert isinstance(stop, Stop)
+    assert stop.status == "stopped"
+
+
 FAULTS: dict[str, tuple[Callable[[Watched, str], object], str]] = {
     "daq": (lambda rig, _: setattr(rig.twin_daq, "unplugged", True), "rig.daq_silent"),
     "servo": (lambda rig, axis: rig.twin_table.silent.add(axis), "rig.servo_silent"),

@@ -8,11 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from calib_core.integral_fit import fit
 from calib_core.problem import Problem
 from calib_core.recording import read as parse
 from calib_core.recording import write_csv
 from calib_core.sequence import Move, Wave, make_plan
-from calib_core.twin import HOST_EPOCH_S, Plant
+from calib_core.twin import HOST_EPOCH_S, Plant, board_truth
 from server.devices import DeviceError, open_rig
 from server.devices.clock import ClockRelation
 from server.devices.protocols import Samples
@@ -166,6 +167,17 @@ def test_encoder_times_are_true_to_the_least_transfer_time_and_stay_so() -> None
     assert abs(plant.daq.spec.clock_error * 200) > 0.001  # uncorrected, the clocks part by more than this
     assert np.mean(error_ms) == pytest.approx(-1e3 * plant.daq.spec.transfer_s, abs=0.1)
     assert np.ptp(error_ms) < 0.6
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_the_integral_fit_finds_the_twins_truth_and_its_one_way_delay(axis: str) -> None:
+    plan = make_plan("standard", seed=1, states=[f"estimate_{axis}"])
+    recording = record(plan, open_rig("twin:?seed=11"), board="B")
+    found, truth = fit(recording, axis), board_truth(11, "B")[axis]
+    assert found.values["scale_factor_V_per_dps"] == pytest.approx(truth.scale_factor, rel=3e-4)
+    assert found.values["bias_V"] == pytest.approx(truth.bias, abs=1e-4)
+    # The least USB transfer, less what the servo latches before the middle of its transaction.
+    assert found.delay_s == pytest.approx(0.0015 - 0.0002, abs=3e-4)
 
 
 @pytest.mark.parametrize("skew", [-1e-4, 0.0, 8e-5])

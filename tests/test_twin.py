@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from calib_core.gyro_models import PRESETS
 from calib_core.model import Model, Noise
 from calib_core.twin import HOST_EPOCH_S, Plant, board_truth
 from calib_core.twin_daq import DaqSpec
@@ -166,6 +167,12 @@ def test_a_seed_is_a_bench_and_a_board_id_is_a_gyro() -> None:
     many = [model for seed in range(200) for model in board_truth(seed).values()]
     assert 1.23 <= min(m.bias for m in many) < max(m.bias for m in many) <= 1.28
     assert 5.7e-3 <= min(m.scale_factor for m in many) < max(m.scale_factor for m in many) <= 6.1e-3
+
+
+def test_the_gyro_on_the_table_is_of_the_model_asked_for() -> None:
+    plain, fourfold = board_truth(1), board_truth(1, gyro_model=PRESETS["LPY503AL-4XOUT"])
+    assert fourfold["x"].scale_factor == pytest.approx(333 / 83 * plain["x"].scale_factor)
+    assert fourfold["x"].bias == plain["x"].bias
 
 
 def test_encoder_readings_are_codes_at_99_hz_with_their_own_times() -> None:

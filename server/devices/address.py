@@ -3,6 +3,7 @@
 from pathlib import Path
 from urllib.parse import parse_qsl
 
+from calib_core.gyro_models import GyroModel
 from calib_core.problem import Problem
 from calib_core.twin import Plant, board_truth
 from server.devices import DeviceError
@@ -50,8 +51,8 @@ def _twin(url: str, rest: str) -> Rig:
     seed = numbers.get("seed", 1)
     table = TwinTable(Plant(seed, covariates=bool(numbers.get("covariates", 0))))
 
-    def mount(board: str) -> None:
+    def mount(board: str, gyro_model: GyroModel) -> None:
         with table.lock:
-            table.plant.mount(board_truth(seed, board))
+            table.plant.mount(board_truth(seed, board, gyro_model))
 
     return Rig(url, table, TwinDaq(table), simulated=True, mount=mount)

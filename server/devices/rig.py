@@ -6,12 +6,14 @@ gyro that does not feel the table turn are found here.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core.gyro_models import GyroModel
 from calib_core.sequence import Axis, Motion
 from server.devices import DeviceError
 from server.devices.clock import ClockRelation
@@ -24,7 +26,7 @@ MEAN_OF = 10
 SCALES = {"temperature_c": 100.0, "supply_v": 2.0}  # an LM35, 10 mV/°C, and a divider by two
 STALL_DEG = 3.0
 STALL_LAG_S = 0.3  # a shaft may be this far behind its command
-LATE_S = 0.05
+LATE_S = 0.05  # rows that waited this long are read before a motion starts
 SILENT_S = 0.5  # no reading of a servo for this long is a fault
 FELT_DPS, FELT_DEG, FELT_V = 20.0, 20.0, 0.015  # turned this fast and this far, the output must have moved this much
 
@@ -83,7 +85,13 @@ class Rig:
     """A table and a DAQ that are used together. Nothing is sent to either before `open`."""
 
     def __init__(
-        self, url: str, table: Table, daq: Daq, *, simulated: bool = False, mount: Callable[[str], None] | None = None
+        self,
+        url: str,
+        table: Table,
+        daq: Daq,
+        *,
+        simulated: bool = False,
+        mount: Callable[[str, GyroModel], None] | None = None,
     ) -> None:
         self.url, self.table, self.daq, self.simulated = url, table, daq, simulated
         self.connected = False
@@ -117,18 +125,25 @@ class Rig:
     def open(self) -> None:
         """Connect every part, also of a rig that is open already; raises the first part's `DeviceError`."""
         self._faults = {}
+        self.connected = True
         for part, device in (("servo", self.table), ("daq", self.daq)):
-            try:
+            with suppress(DeviceError), self._asking(part):
                 device.open()
-            except DeviceError as fault:
-                self._faults[f"servo {fault.values['axis']}" if "axis" in fault.values else part] = fault
-        self.connected = not self._faults
-        if self._faults:
-            raise next(iter(self._faults.values()))
+        for fault in self._faults.values():
+            raise fault
+
+    @contextmanager
+    def _asking(self, part: str) -> Iterator[None]:
+        """Remembers that a part did not answer; a fault of one servo names its axis."""
+        try:
+            yield
+        except DeviceError as fault:
+            self._faults[f"servo {fault.values['axis']}" if "axis" in fault.values else part] = fault
+            self.connected = False
+            raise
 
     def status(self) -> list[dict[str, Any]]:
-        """What is known of each part, without asking it: {"part", "ok": True, False or None (not known), "code",
-        "values"}."""
+        """What is known of each part, without asking it: "part", "ok" (None: not known), "code" and "values"."""
         telemetry = self.table.telemetry() if self.connected else {}
         known: list[dict[str, Any]] = []
         for part in (*(f"servo {axis}" for axis in self.axes), "daq", "gyro"):
@@ -149,10 +164,10 @@ class Rig:
             known.append({"part": part, "ok": said[0], "code": said[1], "values": said[2]})
         return known
 
-    def mount(self, board: str) -> None:
+    def mount(self, board: str, gyro_model: GyroModel) -> None:
         """Say which board is on the table. A simulated rig puts that board's gyro there; a real one has it already."""
         if self._mount is not None:
-            self._mount(board)
+            self._mount(board, gyro_model)
 
     def begin(self) -> None:
         """Start sampling at time zero, and see that every part answers before anything moves."""
@@ -173,8 +188,9 @@ class Rig:
             shaft.from_deg = shaft.commanded_deg(self._now_s)
             shaft.motion, shaft.started_s = motion, self._now_s
             shaft.low_V, shaft.high_V = np.inf, -np.inf
-        if motions:
-            self.table.start(motions)
+        with self._asking("servo"):
+            if motions:
+                self.table.start(motions)
 
     def waiting(self) -> Iterator[Block]:
         """Rows that came while nobody read: to be had before the next motion starts, or its segment would be late."""
@@ -189,12 +205,10 @@ class Rig:
         not feel it turn.
         """
         n = round(seconds / ROW_S)
-        try:
+        with self._asking("daq"):
             samples = self.daq.read(n * MEAN_OF)
-        except DeviceError as fault:
-            self._faults["daq"] = fault
-            self.connected = False
-            raise
+        with self._asking("servo"):
+            readings = self.table.read()
         self._now_s = float(samples.time_s[-1])
         self._clock.add(self._now_s, samples.host_time_s)
         time_s = samples.time_s.reshape(n, MEAN_OF).mean(axis=1)
@@ -205,7 +219,6 @@ class Rig:
             scale = SCALES.get(name, 1.0)
             columns[name] = np.round(scale * volts[:, i], 6)
             fast[name] = np.round(scale * samples.volts[:, i], 6)
-        readings = self.table.read()
         for axis, shaft in self._shafts.items():
             read = readings[axis]
             shaft.take(self._clock.to_daq(read.time_s), read.angle_deg)
@@ -253,5 +266,7 @@ class Rig:
     def close(self) -> None:
         """Leave both devices safe and let go of them."""
         self.connected = False
-        self.table.close()
-        self.daq.close()
+        try:
+            self.table.close()
+        finally:
+            self.daq.close()
