@@ -72,6 +72,7 @@ class Servo:
         self.jammed = False
         self._omega = 2.0 / spec.lag_s
         self._rng = rng
+        self._scatter_deg = 0.0
         self._pieces = [_Piece(-math.inf, start_deg, 0.0, 0.0, 0.0)]
         self._starts = [-math.inf]
 
@@ -81,14 +82,15 @@ class Servo:
         Goal and speed are rounded to the registers' steps, as the real servo takes them.
         """
         self.torque_on = True
-        scatter = float(np.clip(self._rng.normal(0.0, self.spec.stop_scatter_deg), -0.06, 0.06))
         for time_s, goal_deg, rate_dps in goals:
             if self.jammed:
                 return
             at_deg = self._cut(time_s)
+            if self._pieces[-1].rate_dps == 0.0:  # a goal that finds it moving only prolongs the same motion
+                self._scatter_deg = float(np.clip(self._rng.normal(0.0, self.spec.stop_scatter_deg), -0.06, 0.06))
             rate = max(1, round(rate_dps / SPEED_DPS)) * SPEED_DPS * (1.0 + self.spec.speed_error)
             rate = min(rate, self.spec.top_rate_dps)
-            goal = float(to_deg(to_code(np.float64(goal_deg)))) + scatter
+            goal = float(to_deg(to_code(np.float64(goal_deg)))) + self._scatter_deg
             way = goal - at_deg
             way -= math.copysign(min(self.spec.stop_short_deg, abs(way)), way)
             if way:
