@@ -110,3 +110,23 @@ def test_rig_page_names_every_part_and_its_state(window: Window) -> None:
     page.wait_for_selector(".parts li")
     assert page.locator(".parts li").count() == 4
     assert "RX-28" in window.text(".parts")
+
+
+def test_numbers_show_as_many_digits_as_their_uncertainty_allows(window: Window) -> None:
+    page = window.open("/rig.html")
+    pairs = [[5.94823, 0.0031], [1.2630412, 0.000021], [45.61, 1.24], [0.123, 0.00996], [-5.9482, 0.0996], [7.0, 0.0]]
+    written = page.evaluate(
+        "async pairs => { const text = await import('/js/text.js');"
+        " return pairs.map(([value, u]) => text.withUncertainty(value, u)); }",
+        pairs,
+    )
+    assert written == ["5.9482(31)", "1.263041(21)", "45.6(1.2)", "0.123(10)", "−5.95(10)", "7.0000"]
+
+
+def test_limits_decide_and_each_is_shown(window: Window, server: Server) -> None:
+    limits = {"name": "lab", "axes": {"x": {"bias_V": {"min": 2.0}, "rate": {"nonlinearity_pct_fs": {"max": 50.0}}}}}
+    recording = server.call("GET", "/runs?q=LPY-B")["items"][0]["recording"]
+    issued = server.call("POST", "/certificates", {"recording": recording, "spec": limits})
+    assert issued["verdict"] == "fail"
+    page = window.open("/certificates.html")
+    page.wait_for_selector(f"tr:has-text('{issued['number']}'):has-text('fail')")

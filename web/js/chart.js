@@ -197,7 +197,6 @@ export function chart(place, spec) {
         bind: { dblclick: () => () => { zoom(null); return null; } },
       },
       hooks: {
-        drawClear: [],
         drawAxes: [(u) => drawBack(u, spec, state)],
         draw: [(u) => drawNames(u, spec)],
         setCursor: [(u) => read(u.cursor.idx)],

@@ -2,13 +2,13 @@
 
 import { chart } from "./chart.js";
 import { soFar as pointsSoFar, twoSigma } from "./line.js";
+import { UNIT, split } from "./states.js";
 import { t } from "./text.js";
 
 const WINDOW_S = 60;
 const TIME = () => ({ label: t("chart.time"), unit: "s", digits: 2 });
 const withNulls = (values, scale = 1) => Array.from(values, (v) => (Number.isNaN(v) ? null : v * scale));
 
-const UNIT = { rate: "deg/s", position: "deg" };
 
 /** Scatter with line, and residual stems with their ±2σ band, for one rate or position test. */
 export function testCharts(place, kind) {
@@ -44,7 +44,7 @@ export function testCharts(place, kind) {
     // A dot beside the other: the readings of one set-point stand in the order they were taken.
     const width = Math.max(...rows.map((row) => Math.abs(row.reference))) * 0.06;
     const flat = rows.flatMap((row) => [
-      [row.reference, row.bias_error_signed ?? row.mean - row.reference, null],
+      [row.reference, row.mean - row.reference, null],
       ...row.readings.map((value, i) => [row.reference + width * (i / row.readings.length - 0.5), null, value - row.reference]),
     ]).sort((a, b) => a[0] - b[0]);
     residual.rename(t("chart.repeat_name"), t("chart.error"));
@@ -74,15 +74,8 @@ function adaptiveCharts(place, model, axis) {
   const datasheet = model?.axes?.[axis];
   return {
     show(run) {
-      const time = run.columns[`${axis}.trace_time_s`] ? run.column(`${axis}.trace_time_s`) : run.column(`${axis}.time_s`);
-      const put = (plot, values, factor, known) => {
-        const n = Math.min(time.length, values.length);
-        const ys = withNulls(values.subarray(values.length - n), factor);
-        const first = ys.findIndex((v) => v != null);
-        if (first < 0) { plot.set([[], [], []]); return; }
-        const xs = time.subarray(time.length - n + first);
-        plot.set([xs, ys.slice(first), Array(xs.length).fill(known ?? null)]);
-      };
+      const time = run.column(`${axis}.trace_time_s`);
+      const put = (plot, values, factor, known) => plot.set([time, withNulls(values, factor), Array(time.length).fill(known ?? null)]);
       put(bias, run.column(`${axis}.adaptive_bias_V`), 1, datasheet?.bias_V);
       put(scale, run.column(`${axis}.adaptive_scale_factor`), 1000, datasheet && datasheet.scale_factor_V_per_dps * 1000);
     },
@@ -110,8 +103,8 @@ export function livePlots(place, model) {
 
   return {
     show(run) {
-      const [, kind, axis] = /^(\w+)_([xz])$/.exec(run.state ?? "") ?? [];
-      if (!axis) return;
+      if (!run.state) return;
+      const [kind, axis] = split(run.state);
       if (shown !== run.state) {
         evidence?.destroy();
         evidence = kind === "estimate" ? adaptiveCharts(evidencePlace, model, axis) : testCharts(evidencePlace, kind);

@@ -2,11 +2,8 @@
 
 import { facts, h, table } from "./dom.js";
 import { figureAt, figures } from "./figures.js";
+import { UNIT, split, stateName } from "./states.js";
 import { decimals, fixed, minus, plain, sentence, signed, t, withUncertainty } from "./text.js";
-
-export const UNIT = { rate: "deg/s", position: "deg" };
-export const split = (state) => state.split("_");
-export const stateName = (state) => t(`state.${state}`);
 
 /** The two parameters as they are certified, in the units they are read in. */
 const PARAMETERS = [["bias_V", "figure.bias", "V", 1], ["scale_factor_V_per_dps", "figure.scale_factor", "mV/(deg/s)", 1000]];
@@ -15,7 +12,8 @@ const PARAMETERS = [["bias_V", "figure.bias", "V", 1], ["scale_factor_V_per_dps"
 const difference = (measured, datasheet) => (datasheet ? (100 * (measured - datasheet)) / datasheet : null);
 
 /** What stands beside the certified values: the adaptive estimate, or in profile thesis, where that is certified, the fit. */
-const beside = (result) => result.integral_fit ?? result.adaptive;
+const isThesis = (result) => result.adaptive.form === "thesis";
+const beside = (result) => (isThesis(result) ? result.integral_fit : result.adaptive);
 
 function estimateRows(result) {
   return PARAMETERS.map(([key, name, unit, factor]) => {
@@ -44,7 +42,7 @@ export function estimateSummary(axis, result) {
 }
 
 const estimateHead = (result) => [t("result.parameter"),
-  ...["certified", "expanded", result.integral_fit ? "integral" : "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
+  ...["certified", "expanded", isThesis(result) ? "integral" : "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
 
 /** What else the estimate state found: the motion's delay, the filter in use and whether it suits, the rig's step. */
 function conditions({ delay_s: delay, noise, kalman, step_check: step }) {

@@ -54,7 +54,7 @@ export function rigCard(place, { full = false } = {}) {
   function show(next) {
     const isNew = JSON.stringify(next) !== JSON.stringify(rig);
     rig = next;
-    if (!isNew || place.contains(document.activeElement) && document.activeElement !== check && document.activeElement.tagName !== "SELECT") return;
+    if (!isNew || document.activeElement === url) return;
     const choices = [...next.choices];
     if (!choices.some(({ url: known }) => known === next.url)) choices.push({ url: next.url, label: next.url });
     choice.replaceChildren(...choices.map(({ url: known, label }) => h("option", { value: known }, label)), h("option", { value: OTHER }, t("rig.other")));

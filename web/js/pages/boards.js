@@ -13,7 +13,7 @@ page("boards", async (main) => {
 
 async function showBoards(main) {
   const place = h("section", { class: "panel stack" });
-  main.append(h("h1", {}, t("page.boards")), place);
+  main.append(h("div", { class: "row spread" }, h("h1", {}, t("page.boards")), h("a", { href: "/run.html" }, t("run.all"))), place);
   await list(place, {
     load: (q) => api.boards({ ...q, limit: 50 }),
     label: t("page.boards"),

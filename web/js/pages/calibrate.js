@@ -5,10 +5,10 @@ import { $, facts, h, say } from "../dom.js";
 import { loadFigures } from "../figures.js";
 import { watch } from "../live.js";
 import { livePlots } from "../plots.js";
-import { estimateSummary, limitsCard, resultCard, split, stateName } from "../results.js";
+import { estimateSummary, limitsCard, resultCard } from "../results.js";
 import { Setup } from "../setup.js";
 import { notice, page, speedWord } from "../shell.js";
-import { STATES, showStates } from "../states.js";
+import { STATES, showStates, split, stateName } from "../states.js";
 import { duration, sentence, t } from "../text.js";
 
 const FRAME_MS = 45;   // the screen's next picture after this: 20 a second, no more
@@ -81,6 +81,7 @@ async function plan() {
 async function start() {
   clearTimeout(planTimer);
   setup.refuse(null);
+  notice("stop", null);
   isStarting = true;
   $("#start").disabled = true;
   try {
@@ -103,7 +104,14 @@ async function follow(id) {
   if (watched === id) return;
   leave();
   watched = id;
-  const run = await api.run(id);
+  let run;
+  try {
+    run = await api.run(id);
+  } catch (problem) {
+    watched = null;
+    notice("live", problem.message, "fail");
+    return;
+  }
   const models = setup.models.length ? setup.models : (await api.gyroModels()).items;
   $("#setup").hidden = true;
   $("#mounting").hidden = true;
@@ -119,8 +127,6 @@ async function follow(id) {
     [t("setup.readings"), run.readings], [t("rig.rig"), run.rig], [t("run.seed"), run.seed == null ? null : String(run.seed)],
   ]));
   const plots = livePlots($("#charts"), models.find((model) => model.id === run.gyro_model));
-  const names = run.states.map((state) => state.name);
-  const shownResults = new Map();
   let latest = null;
   let asked = null;
   let drawn = 0;
@@ -130,41 +136,35 @@ async function follow(id) {
     asked = null;
     drawn = now;
     plots.show(latest);
-    showProgress(names, latest);
+    showProgress(latest);
   }
 
-  function showResults(results) {
-    for (const [state, result] of Object.entries(results)) {
-      const text = JSON.stringify(result);
-      if (shownResults.get(state) === text) continue;
-      shownResults.set(state, text);
+  function showResults(fresh, all) {
+    for (const [state, result] of Object.entries(fresh)) {
       const card = resultCard(state, result);
       const old = $(`#result-${state}`);
       if (old) old.replaceWith(card); else $("#results").append(card);
     }
-    const estimates = [...shownResults.keys()].filter((state) => split(state)[0] === "estimate");
-    $("#summary").replaceChildren(facts(estimates.flatMap((state) => estimateSummary(split(state)[1], results[state]))));
+    const estimates = Object.entries(all).filter(([state]) => split(state)[0] === "estimate");
+    $("#summary").replaceChildren(facts(estimates.flatMap(([state, result]) => estimateSummary(split(state)[1], result))));
   }
 
   const unwatch = watch(id, {
-    onFrame(soFar) {
+    onFrame(soFar, frame) {
       latest = soFar;
       asked ??= requestAnimationFrame(draw);
-      showResults(soFar.results);
-      if (soFar.ended) end(id);
+      if (Object.keys(frame.results).length) showResults(frame.results, soFar.results);
+      if (soFar.ended) end(id, Object.keys(soFar.columns).length > 0);
     },
     onConnection: (text) => notice("live", text, "fail"),
   });
   leave = () => { unwatch(); plots.destroy(); cancelAnimationFrame(asked); };
 }
 
-function showProgress(names, soFar) {
-  const progress = soFar.progress ?? {};
+function showProgress(soFar) {
   if (soFar.ended) return;
-  const at = names.indexOf(soFar.state);
-  showStates($("#states"), names.map((name, i) => ({
-    name, fraction: progress.state_fraction, status: i < at ? "done" : i === at ? "running" : "waiting",
-  })));
+  const progress = soFar.progress ?? {};
+  showStates($("#states"), soFar.states.map((state) => ({ ...state, fraction: progress.state_fraction })));
   $("#headline").textContent = soFar.state ? `${STATES.indexOf(soFar.state) + 1} ${stateName(soFar.state)}` : t("calibrate.starting");
   $("#left").textContent = [
     progress.of ? t("calibrate.done_of", { done: progress.done, of: progress.of }) : null,
@@ -174,16 +174,15 @@ function showProgress(names, soFar) {
 }
 
 /** The run is over, in whatever way: the sentence, the documents, the next step. */
-async function end(id) {
+async function end(id, hasPictures) {
   const run = await api.run(id);
   if (watched !== id) return;
+  document.dispatchEvent(new Event("rig-asked"));
+  $("#live").hidden = !hasPictures;
   $("#stop-run").hidden = true;
   $(".work").classList.add("ended");
   $("#left").textContent = run.duration_s == null ? "" : t("calibrate.took", { duration: duration(run.duration_s) });
   showStates($("#states"), run.states);
-  for (const state of run.states) {
-    if (state.result && !$(`#result-${state.name}`)) $("#results").append(resultCard(state.name, state.result));
-  }
   const number = run.certificate;
   const certificate = number ? await api.certificate(number).catch(() => null) : null;
   $("#results").prepend(...[limitsCard(certificate)].filter(Boolean));

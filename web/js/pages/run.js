@@ -5,9 +5,9 @@ import { chart } from "../chart.js";
 import { loadFigures } from "../figures.js";
 import { facts, h, say, table } from "../dom.js";
 import { testCharts } from "../plots.js";
-import { budgetTable, limitsCard, linearityTable, repeatTable, resultCard, split, stateName } from "../results.js";
+import { budgetTable, limitsCard, linearityTable, repeatTable, resultCard } from "../results.js";
 import { page } from "../shell.js";
-import { showStates } from "../states.js";
+import { showStates, split, stateName } from "../states.js";
 import { duration, fixed, sentence, t, when } from "../text.js";
 
 page("run", async (main) => {
