@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 SUFFIX = {"V": "V", "deg/s": "dps", "counts": "counts"}
 ROUNDS = 3
 """Rounds over the codes; a fourth moves S by less than a hundredth of its uncertainty."""
+ENOUGH = 1e-3
+"""A step, in standard uncertainties, that no longer matters."""
 SOFTEST = 0.5
 """Readings noisier than this, in steps, blur the codes' edges: they are taken as Gaussian."""
 MOVED_STEPS = 20.0
@@ -119,8 +121,7 @@ class Design:
 
     def output(self, delay_s: float) -> F64:
         """(n,) the gyro's mean output over the rows, its delay taken out."""
-        s = self.averages.samples
-        return self.averages.mean(s.output, shift_s=delay_s, average_s=s.average_s)
+        return self.averages.output(delay_s)[0]
 
     def columns(self, delay_s: float, values: F64) -> F64:
         """(n, p) bias; then, where something moved, rate and delay (s, as a change from ``delay_s``)."""
@@ -132,7 +133,7 @@ class Design:
             grid = s.time_s[self.averages.at]
             rate = np.interp(grid - delay_s, grid, self.rate)
             return np.column_stack([one, rate, -values[1] * np.gradient(rate, grid)])
-        change = self.averages.change(self.averages.samples.output, shift_s=delay_s)
+        change = self.averages.output(delay_s)[1]
         return np.column_stack([one, self.rate, np.where(self.averages.at < 0, -change, 0.0)])
 
     def solve(self) -> "Solution":
@@ -212,26 +213,24 @@ class Design:
     def estimate(self, y: F64, columns: F64, noise: RowNoise, values: F64) -> tuple[F64, F64]:
         """Parameters (p,) and covariance (p, p) for given noise, from the start ``values``.
 
-        With r = y - Xb and C = cov of the encoder's errors in the rate, the score of r'Σ⁻¹r in S is x'Σ⁻¹r + S·h'Ch,
-        h = Σ⁻¹r: the second term is what x'Σ⁻¹r owes to the error that x and r share.
+        With r = y - Xb and C the covariance of the encoder's errors in the rate, the score of r'Σ⁻¹r in S is
+        x'Σ⁻¹r + S·h'Ch, h = Σ⁻¹r: the second term is what x'Σ⁻¹r owes to the error that x and r share.
         """
-        weighted = self.rows
+        rows, shared = self.rows, np.zeros(len(values))
         if self.readings is not None:
-            weighted = replace(weighted, reading_variance=weighted.reading_variance * self.readings.recurrence)
-        values = values.copy()
+            rows = replace(rows, reading_variance=rows.reading_variance * self.readings.recurrence)
         for _ in range(3):
             scale_factor = values[1] if len(values) > 1 else 0.0
-            whitener = Whitener(weighted, scale_factor, noise)
+            whitener = Whitener(rows, scale_factor, noise)
             white = whitener.whiten(np.column_stack([columns, y]))
             x, residual = white[:, :-1], white[:, -1] - white[:, :-1] @ values
-            score = x.T @ residual
-            if len(weighted.reading_variance) and len(values) > 1:
-                shared = weighted.to_readings(whitener.precision_times(residual))
-                score[1] += scale_factor * float(weighted.reading_variance @ shared**2)
-            covariance = _inverse(x.T @ x)
-            step = covariance @ score
-            values = values + step
-            if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
+            if self.readings is not None and len(values) > 1:
+                pull = rows.to_readings(whitener.precision_times(residual))
+                shared[1] = scale_factor * float(rows.reading_variance @ pull**2)
+            q, root = _factors(x)
+            step = root @ (q.T @ residual + root.T @ shared)
+            values, covariance = values + step, root @ root.T
+            if np.all(np.abs(step) < ENOUGH * np.sqrt(np.diag(covariance))):
                 break
         return values, covariance
 
@@ -264,10 +263,11 @@ def _slopes(rows: Rows, level_deg: F64) -> F64:
     return rate
 
 
-def _inverse(gram: F64) -> F64:
-    """Of a positive definite matrix whose columns have very different units."""
-    scale = 1.0 / np.sqrt(np.diag(gram))
-    return np.asarray(np.linalg.inv(gram * np.outer(scale, scale)) * np.outer(scale, scale))
+def _factors(columns: F64) -> tuple[F64, F64]:
+    """Q (n, p) with orthonormal columns and R⁻¹ (p, p) with Q = columns·R⁻¹; units may differ by any factor."""
+    scale = 1.0 / np.linalg.norm(columns, axis=0)
+    q, r = np.linalg.qr(columns * scale)
+    return q, np.asarray(scale[:, None] * np.linalg.inv(r))
 
 
 def _report(design: Design, solution: Solution) -> Fit:

@@ -51,7 +51,7 @@ class Noise:
                 # x_k = φ·x_{k-1} + e_k, solved for all k at once: x_k = φᵏ·(x_0 + Σ e_i/φⁱ).
                 part[:] = power * (last + np.cumsum(drive * rng.standard_normal(len(part)) / power))
                 last = float(part[-1])
-            return white * rng.standard_normal(n) + correlated
+            return np.asarray(white * rng.standard_normal(n) + correlated)
 
         return draw
 

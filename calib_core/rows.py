@@ -6,6 +6,8 @@ per sample. Columns of effects are averaged over the same intervals by ``Average
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +20,11 @@ from calib_core.whitening import Rows
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Operator = Any  # a scipy.sparse matrix
 
 REGULAR = 0.01
 """Relative variance added to each row's white noise, for what the trapezoid rule leaves out."""
+DELAY_GRID_S = 2e-4
 GAP = 2.5
 """A gap of more than this many sampling intervals interrupts the record."""
 
@@ -51,55 +55,105 @@ class Averages:
     at: Ints
     """(n,) that sample, -1 for an interval."""
 
-    def mean(self, values: F64, *, shift_s: float = 0.0, average_s: float = 0.0) -> F64:
-        """(n,) means of ``values`` (k,) over the intervals, moved later by ``shift_s``; samples stay where they are."""
-        out = np.empty(len(self.at))
-        single = self.at >= 0
-        out[single] = values[self.at[single]]
-        between = ~single
-        if between.any():
-            s = self.samples
-            begin, end = self.begin_s[between], self.end_s[between]
-            integral = Integral(s.time_s, values, s.start, average_s)
-            out[between] = (integral(end + shift_s) - integral(begin + shift_s)) / (end - begin)
-        return out
+    def mean(self, values: F64) -> F64:
+        """(n,) or (n, p): means of ``values`` (k,) or (k, p) over the intervals, by the corrected trapezoid rule."""
+        return np.asarray(self._operators(0.0)[0] @ values)
 
-    def change(self, values: F64, *, shift_s: float = 0.0) -> F64:
-        """(n,) (end - beginning)/length of ``values`` (k,) over the intervals, moved likewise; for a sample, its slope."""
+    def change(self, values: F64) -> F64:
+        """(n,) or (n, p): (end - beginning)/length of ``values`` (k,) or (k, p); for a sample, its slope."""
+        return np.asarray(self._operators(0.0)[1] @ values)
+
+    def output(self, delay_s: float) -> tuple[F64, F64]:
+        """(n,) the gyro's output, the intervals taken ``delay_s`` later, and its change by that delay.
+
+        Samples that are means over a span w have lost w²/24·f''; its integral is put back.
+        """
         s = self.samples
-        slope = np.gradient(values, s.time_s)
-        out = slope[np.maximum(self.at, 0)]
-        between = self.at < 0
-        begin, end = self.begin_s[between], self.end_s[between]
-        ends = (np.interp(t + shift_s, s.time_s, values) for t in (begin, end))
-        out[between] = -np.subtract(*ends) / (end - begin)
-        return out
+        near = DELAY_GRID_S * round(delay_s / DELAY_GRID_S)  # from there it is linear enough
+        mean, change = self._operators(near)
+        slope = change @ s.output
+        lost = np.where(self.at < 0, change @ np.gradient(s.output, s.time_s), 0.0) * s.average_s**2 / 24.0
+        onward = np.where(self.at < 0, slope, 0.0) * (delay_s - near)
+        return np.asarray(mean @ s.output - lost + onward), np.asarray(slope)
+
+    @cached_property
+    def _cache(self) -> dict[float, tuple[Operator, Operator]]:
+        return {}
+
+    def _operators(self, delay_s: float) -> tuple[Operator, Operator]:
+        """Sparse (n, k): mean and change, the intervals taken ``delay_s`` later."""
+        if delay_s not in self._cache:
+            if len(self._cache) > 1:
+                self._cache.popitem()
+            self._cache[delay_s] = self._build(delay_s)
+        return self._cache[delay_s]
+
+    def _build(self, delay_s: float) -> tuple[Operator, Operator]:
+        from scipy.sparse import coo_array, diags_array
+
+        time, n, k = self.samples.time_s, len(self.at), len(self.samples.time_s)
+        single, between = np.flatnonzero(self.at >= 0), np.flatnonzero(self.at < 0)
+        slope = _gradient(time)
+        mean, tilt, change = _Entries(), _Entries(), _Entries()
+        mean.add(single, self.at[single], 1.0)
+        bounds, per_dt = [], 1.0 / (self.end_s - self.begin_s)[between]
+        for sign, moment in ((-1.0, self.begin_s), (1.0, self.end_s)):
+            i = np.clip(np.searchsorted(time, moment[between] + delay_s, side="right") - 1, 0, k - 2)
+            h = time[i + 1] - time[i]
+            u = (moment[between] + delay_s - time[i]) / h
+            _cubic(mean, tilt, between, i, u, sign * h * per_dt, h)
+            change.add(between, i, (1.0 - u) * sign * per_dt)
+            change.add(between, i + 1, u * sign * per_dt)
+            bounds.append(i)
+        # The whole pieces between the two: rows that span several samples have several.
+        count = bounds[1] - bounds[0]
+        row = np.repeat(np.arange(len(between)), count)
+        piece = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + bounds[0][row]
+        h = np.diff(time)[piece]
+        _cubic(mean, tilt, between[row], piece, np.ones(len(row)), h * per_dt[row], h)
+        shape = (n, k)
+        steep = coo_array(change.coordinates, shape=shape).tocsr()
+        steep += diags_array(np.where(self.at >= 0, 1.0, 0.0)) @ slope[np.maximum(self.at, 0)]
+        level, lean = (coo_array(e.coordinates, shape=shape).tocsr() for e in (mean, tilt))
+        return level + lean @ slope, steep
 
 
-class Integral:
-    """∫ values dt as a function of time: the integral of the cubic through values and slopes.
+class _Entries:
+    """Entries of a sparse matrix, gathered piece by piece."""
 
-    At the samples this is the corrected trapezoid rule, -h²/12·(f'(b) - f'(a)). Samples that are means over a span w
-    of the signal have lost w²/24·f''; its integral is put back.
+    def __init__(self) -> None:
+        self._parts: list[tuple[Ints, Ints, F64]] = []
+
+    def add(self, row: Ints, column: Ints, value: F64 | float) -> None:
+        self._parts.append((row, column, np.broadcast_to(value, row.shape)))
+
+    @property
+    def coordinates(self) -> tuple[F64, tuple[Ints, Ints]]:
+        row, column, value = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        return value, (row, column)
+
+
+def _cubic(level: _Entries, slope: _Entries, row: Ints, i: Ints, u: F64, weight: F64, h: F64) -> None:
+    """Adds weight/h·∫ from sample i to u of the way to the next, of the cubic through both values and slopes.
+
+    For u = 1 that is the trapezoid rule less h²/12·(f'(b) - f'(a)).
     """
+    level.add(row, i, weight * (u - u**3 + u**4 / 2.0))
+    level.add(row, i + 1, weight * (u**3 - u**4 / 2.0))
+    slope.add(row, i, weight * h * (u**2 / 2.0 - 2.0 * u**3 / 3.0 + u**4 / 4.0))
+    slope.add(row, i + 1, weight * h * (u**4 / 4.0 - u**3 / 3.0))
 
-    def __init__(self, time_s: F64, values: F64, start: Mask, average_s: float = 0.0) -> None:
-        self._t, self._f = time_s, values
-        self._slope = np.gradient(values, time_s)
-        h = np.diff(time_s)
-        piece = h * (values[1:] + values[:-1]) / 2.0 - h**2 / 12.0 * np.diff(self._slope)
-        piece[start[1:]] = 0.0
-        self._sum = np.concatenate([[0.0], np.cumsum(piece)])
-        self._blur = average_s**2 / 24.0
 
-    def __call__(self, at_s: F64) -> F64:
-        k = np.clip(np.searchsorted(self._t, at_s, side="right") - 1, 0, len(self._t) - 2)
-        h = self._t[k + 1] - self._t[k]
-        u = (at_s - self._t[k]) / h
-        f0, f1, d0, d1 = self._f[k], self._f[k + 1], h * self._slope[k], h * self._slope[k + 1]
-        inside = u * (f0 + u * (d0 / 2 + u * ((3 * (f1 - f0) - 2 * d0 - d1) / 3 + u * (2 * (f0 - f1) + d0 + d1) / 4)))
-        slope = self._slope[k] + u * (self._slope[k + 1] - self._slope[k])
-        return np.asarray(self._sum[k] + h * inside - self._blur * slope)
+def _gradient(time_s: F64) -> Operator:
+    """Sparse (k, k): slopes at the samples, as numpy.gradient takes them."""
+    from scipy.sparse import diags_array
+
+    h = np.diff(time_s)
+    before, after = h[:-1], h[1:]
+    low = np.append(-after / (before * (before + after)), -1.0 / h[-1])
+    middle = np.concatenate([[-1.0 / h[0]], (after - before) / (before * after), [1.0 / h[-1]]])
+    high = np.append(1.0 / h[0], before / (after * (before + after)))
+    return diags_array([low, middle, high], offsets=[-1, 0, 1]).tocsr()
 
 
 def samples(recording: Recording, axis: str, mask: Mask | None = None) -> Samples:
@@ -195,7 +249,7 @@ def _white(s: Samples, begin_s: F64, end_s: F64, at: Ints, start: Mask) -> tuple
         return np.asarray(out + np.where(apart == 1, 2.0 * r * q, 0.0))
 
     def _at(time_s: F64) -> F64:
-        return np.interp(time_s, s.time_s, np.arange(float(len(s.time_s))))
+        return np.asarray(np.interp(time_s, s.time_s, np.arange(float(len(s.time_s)))))
 
     own, next_ = np.ones(len(at)), np.zeros(len(at))
     moving = at < 0

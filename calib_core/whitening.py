@@ -5,7 +5,7 @@ white plus AR(1). A row between two encoder readings carries (S/dt)·(error befo
 an error; rows at rest or with a reference rate carry none. METHOD 2 (n: quantisation plus a random walk), differenced.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+PER_ROW = ("time_s", "dt_s", "start", "before", "after", "white_own", "white_next")
 TAIL = 512
 """Rows after a rest over which its error is followed first; doubled until it has faded."""
 
@@ -65,12 +66,18 @@ class Rows:
     def take(self, chosen: Ints) -> "Rows":
         """The rows ``chosen`` (increasing); nothing is carried over where one was left out."""
         start = self.start[chosen] | (np.diff(chosen, prepend=-2) != 1)
-        before, after = self.before[chosen], self.after[chosen]
         white_next = np.where(np.append(start[1:], True), 0.0, self.white_next[chosen])
-        return Rows(
-            self.time_s[chosen], self.dt_s[chosen], start, before, after,
-            self.reading_variance, self.white_own[chosen], white_next,
-        )  # fmt: skip
+        return replace(self.reordered(chosen), start=start, white_next=white_next)
+
+    @cached_property
+    def resting_last(self) -> Ints | None:
+        """(n,) an order that puts rows without encoder behind the others; None where it is this one already."""
+        order = np.argsort(self.before < 0, kind="stable")
+        return None if np.array_equal(order, np.arange(len(self))) else order
+
+    def reordered(self, order: Ints) -> "Rows":
+        """The same rows in another order that keeps moving rows in theirs."""
+        return replace(self, **{name: getattr(self, name)[order] for name in PER_ROW})
 
     def to_readings(self, values: F64) -> F64:
         """(m,) how the readings' errors (deg) meet ``values`` (n,): the adjoint of errors -> rows, for S = 1."""
@@ -90,6 +97,10 @@ class Whitener:
     def __init__(self, rows: Rows, scale_factor: float, noise: RowNoise) -> None:
         from scipy.linalg import cholesky_banded
 
+        # Without AR(1) noise the rows at rest stand alone: put last, they leave no gap between entry and exit.
+        self._order = None if noise.ar1 > 0.0 else rows.resting_last
+        if self._order is not None:
+            rows = rows.reordered(self._order)
         self._rows = rows
         n = len(rows)
         reading = scale_factor**2 * (rows.reading_variance + noise.reading_deg**2)
@@ -156,10 +167,18 @@ class Whitener:
 
     def whiten(self, columns: F64) -> F64:
         """(n,) or (n, p) in, the same shape out."""
-        return self._shrink(self._lower(self._filter(columns)))
+        if self._order is None:
+            return self._shrink(self._lower(self._filter(columns)))
+        out = np.empty_like(columns)
+        out[self._order] = self._lower(columns[self._order])
+        return out
 
     def precision_times(self, white: F64) -> F64:
         """Σ⁻¹·x (n,) for a column that ``whiten`` turned into ``white``."""
+        if self._order is not None:
+            out = np.empty_like(white)
+            out[self._order] = self._lower(white[self._order], transposed=True)
+            return out
         out = self._lower(self._shrink(white), transposed=True)
         out[:-1] -= self._phi[1:] * out[1:]
         return out
