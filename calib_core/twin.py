@@ -86,10 +86,10 @@ class Plant:
         self.mount(models or board_truth(seed))
 
     def mount(self, models: Mapping[str, Model]) -> None:
-        """Put this gyro on the table."""
-        self.models = dict(models)
-        rate = self.daq.spec.rate_hz
-        self._output = {axis: model.simulator(axis, rate, self._noise.spawn(1)[0]) for axis, model in models.items()}
+        """Put this gyro on the table; its axes are wired to the channels in their order."""
+        self.models = dict(sorted(models.items()))
+        rate_hz = self.daq.spec.rate_hz
+        self._output = {a: model.simulator(a, rate_hz, self._noise.spawn(1)[0]) for a, model in self.models.items()}
 
     @property
     def host_time_s(self) -> float:

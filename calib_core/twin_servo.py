@@ -20,14 +20,15 @@ SPEED_DPS = 0.666  # one step of the moving-speed register, 0.111 rpm
 CENTRE = 512
 
 
-def to_code(angle_deg: F64) -> NDArray[np.int64]:
+def to_code(angle_deg: F64 | float) -> NDArray[np.int64]:
     """Register value of an angle: 0…1023, 512 at 0°."""
-    return np.clip(np.rint(angle_deg / STEP_DEG) + CENTRE, 0, 1023).astype(np.int64)
+    code: NDArray[np.int64] = np.clip(np.rint(angle_deg / STEP_DEG) + CENTRE, 0, 1023).astype(np.int64)
+    return code
 
 
 def to_deg(code: NDArray[np.int64]) -> F64:
     """The angle a register value stands for."""
-    return (code - CENTRE) * STEP_DEG
+    return STEP_DEG * np.asarray(code - CENTRE, np.float64)
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Servo:
                 self._scatter_deg = float(np.clip(self._rng.normal(0.0, self.spec.stop_scatter_deg), -0.06, 0.06))
             rate = max(1, round(rate_dps / SPEED_DPS)) * SPEED_DPS * (1.0 + self.spec.speed_error)
             rate = min(rate, self.spec.top_rate_dps)
-            goal = float(to_deg(to_code(np.float64(goal_deg)))) + self._scatter_deg
+            goal = float(to_deg(to_code(goal_deg))) + self._scatter_deg
             way = goal - at_deg
             way -= math.copysign(min(self.spec.stop_short_deg, abs(way)), way)
             if way:

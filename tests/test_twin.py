@@ -39,7 +39,7 @@ def test_a_move_runs_at_the_registers_speed_and_lags_by_its_pd_loop() -> None:
     assert rate[0] == 0.0
     assert rate[1] == pytest.approx(75 * SPEED_DPS)
     assert angle[1] == pytest.approx(75 * SPEED_DPS * (1.0 - RX28.lag_s), abs=1e-6)
-    assert angle[3] == pytest.approx(float(to_deg(to_code(np.float64(90.0)))))
+    assert angle[3] == pytest.approx(float(to_deg(to_code(90.0))))
     assert rate[3] == pytest.approx(0.0, abs=1e-12)
 
 
