@@ -39,7 +39,7 @@ def conduct(
     abort: threading.Event,
     live: LiveRun | None = None,
 ) -> dict[str, Any]:
-    """Runs a queued run to its end; gives {"status", "message": {"code", "values"} | None, "certificate"}.
+    """Runs a queued run to its end; gives {"status", "message": {"code", "values"} | None, "certificate", "states"}.
 
     ``rig`` gives the rig, opened or not. Does not raise what ends a run: that is its message.
     """
@@ -56,9 +56,7 @@ def conduct(
     except Problem:
         # A full disk may refuse even this line; the next start of the server finds the run open and marks it.
         log.exception("run %s: its end could not be stored", run)
-    if live is not None:
-        live.feed({**last, "states": _states(store, run)})
-    return last
+    return {**last, "states": _states(store, run)}
 
 
 def _message(problem: Problem) -> dict[str, Any]:

@@ -31,6 +31,7 @@ STATUS = {
     "request.too_large": 413,
     "recording.too_large": 413,
     "server.fault": 500,
+    "rig.stop_not_confirmed": 503,
     "worker.not_ready": 503,
     "worker.no_answer": 503,
     "store.locked": 503,

@@ -6,22 +6,22 @@ import math
 import multiprocessing
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as TookTooLong
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any, Literal
 
 from calib_core.problem import Problem
 from server import worker
-from server.live import LiveRun, decode
+from server.live import ENDED, LiveRun, decode
 from server.settings import Settings
 from server.store import Store
 
 log = logging.getLogger("gyrobench")
 KEPT_RUNS = 4  # live runs that a page may still want after their end
-STOP_S = 0.3
-HUNG_S = 2.0  # a worker that has not said "safe" by then is ended, and the next one makes the motors safe
+CONFIRMED_S = 2.0  # a stop takes milliseconds; a worker that has not confirmed it by then hangs
 REPLY_S = 15.0
 RESTART_S = 1.0
 
@@ -31,14 +31,15 @@ class Supervisor:
         self._settings = settings
         self._store = store
         self._send_lock = threading.Lock()
-        self._lock = threading.RLock()
+        self._claim = threading.Lock()
         self._pipe: Connection | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
-        self._replies: dict[int, Future[Any]] = {}
+        self._replies: dict[int, Future[None]] = {}
         self._numbers = itertools.count(1)
         self._closing = threading.Event()
         self._ready = threading.Event()
-        self._safe = threading.Event()
+        self._idle = threading.Event()
+        self._idle.set()
         self._thread = threading.Thread(target=self._loop, name="supervisor", daemon=True)
         self._started = False
         self.url, self.speed = settings.rig, settings.speed
@@ -69,71 +70,76 @@ class Supervisor:
 
     # --- commands ----------------------------------------------------------------------------------------------
     def begin(self, run: str, speed: float, head: Mapping[str, Any]) -> None:
-        """Hands a stored, queued run to the worker. The caller holds `claim`."""
-        with self._lock:
-            self.live[run] = LiveRun(run, {"message": None, "certificate": None})
-            self.live[run].feed({**head, "speed": speed if math.isfinite(speed) else "max"})
-            for old in list(self.live)[:-KEPT_RUNS]:
-                del self.live[old]
-            self.run = run
+        """Hands a stored, queued run to the worker. The caller is inside `free`."""
+        live = LiveRun(run, {"message": None, "certificate": None})
+        live.feed({**head, "speed": speed if math.isfinite(speed) else "max"})
+        self.live = {**dict(list(self.live.items())[-KEPT_RUNS + 1 :]), run: live}
+        self._idle.clear()
+        self.run = run
         if not self._send("run", run, speed):
             self._interrupt(run)
 
-    def claim(self) -> threading.RLock:
-        """Held while a run is made, so that two requests cannot both find the rig free."""
-        return self._lock
+    @contextmanager
+    def free(self) -> Iterator[None]:
+        """Held while a run is made or the rig changed, so that two requests cannot both find the rig free.
 
-    def check_free(self) -> None:
-        """Raises Problem while a run is on, or where no worker is there to take one."""
-        if self.run is not None:
-            raise Problem("run.busy", run=self.run)
-        if not self._ready.wait(REPLY_S):
-            raise Problem("worker.not_ready")
+        Raises Problem while a run is on, or where no worker is there to take one.
+        """
+        with self._claim:
+            run = self.run
+            # A run whose end is stored is over; that its worker says so too takes a moment more.
+            if run is not None and not (self._stored_end(run) and self._idle.wait(CONFIRMED_S)):
+                raise Problem("run.busy", run=run)
+            if not self._ready.wait(REPLY_S):
+                raise Problem("worker.not_ready")
+            yield
+
+    def _stored_end(self, run: str) -> bool:
+        return self._store.runs.get(run)["status"] in ENDED
 
     def open_rig(self, url: str, speed: float) -> None:
         """Changes the rig; raises Problem where it does not open, and the worker is then without one."""
-        self.check_free()
-        self.url, self.speed = url, speed
-        self._ask("open", url)
+        with self.free():
+            self.url, self.speed = url, speed
+            self._ask("open", url)
 
     def check_rig(self) -> None:
-        self.check_free()
-        self._ask("check")
+        with self.free():
+            self._ask("check")
 
-    def stop(self) -> bool:
-        """Stops whatever moves, and waits for the motors to be safe; True where they are within 0.3 s."""
-        self._safe.clear()
-        if not self._send("stop"):
-            return False  # no worker, so nothing of ours moves; the next one makes the motors safe first
-        if self._safe.wait(STOP_S):
-            return True
-        threading.Thread(target=self._end_if_hung, args=[self._process], daemon=True).start()
-        return False
+    def stop(self) -> None:
+        """Stops whatever moves and waits until the worker says that the motors are safe.
+
+        Raises Problem where it does not say so; it is ended then, and the next one makes them safe before all else.
+        """
+        if not self._ready.is_set():
+            return  # a worker that is starting moves nothing, and makes the motors safe first
+        process = self._process
+        try:
+            self._ask("stop", seconds=CONFIRMED_S)
+        except Problem as problem:
+            if problem.code == "worker.no_answer" and process is not None:
+                log.error("the worker does not answer the stop; ending it")
+                process.kill()
+            raise Problem("rig.stop_not_confirmed") from problem
 
     def stop_run(self, run: str) -> None:
         """Stops this run and waits a moment for its end to be stored. Raises Problem where it is not on."""
-        if self.run != run:
+        if self.run != run or self._stored_end(run):
             raise Problem("run.not_running", run=run)
-        ended = threading.Event()
-        leave = self.live[run].watch(lambda: ended.set() if self.live[run].ended else None)
         self.stop()
-        ended.wait(HUNG_S)
-        leave()
+        self._idle.wait(CONFIRMED_S)
 
-    def _end_if_hung(self, process: "multiprocessing.process.BaseProcess | None") -> None:
-        if not self._safe.wait(HUNG_S) and process is not None:
-            log.error("the worker does not answer the stop; ending it")
-            process.kill()
-
-    def _ask(self, command: str, *arguments: object) -> Any:
-        number, reply = next(self._numbers), Future[Any]()
+    def _ask(self, command: str, *arguments: object, seconds: float = REPLY_S) -> None:
+        """Sends a command and waits for its reply; raises the Problem that it answers with."""
+        number, reply = next(self._numbers), Future[None]()
         self._replies[number] = reply
         try:
             if not self._send(command, number, *arguments):
                 raise Problem("worker.not_ready")
-            return reply.result(REPLY_S)
+            reply.result(seconds)
         except TookTooLong:
-            raise Problem("worker.no_answer", seconds=REPLY_S) from None
+            raise Problem("worker.no_answer", seconds=seconds) from None
         finally:
             self._replies.pop(number, None)
 
@@ -194,9 +200,9 @@ class Supervisor:
         self._ended(run, {"status": "interrupted", "message": message})
 
     def _ended(self, run: str, last: Mapping[str, Any]) -> None:
-        with self._lock:
-            if self.run == run:
-                self.run = None
+        if self.run == run:
+            self.run = None
+            self._idle.set()
         if run in self.live:
             self.live[run].feed(last)
 
@@ -208,15 +214,13 @@ class Supervisor:
             case "rig", (dict(status),):
                 self.rig = status
                 self._ready.set()
-            case "reply", (int(number), result):
+            case "reply", (int(number), refusal):
                 reply = self._replies.get(number)
                 if reply is not None and not reply.done():
-                    if isinstance(result, Problem):
-                        reply.set_exception(result)
+                    if refusal is None:
+                        reply.set_result(None)
                     else:
-                        reply.set_result(result)
-            case "safe", ():
-                self._safe.set()
+                        reply.set_exception(refusal)
             case "ended", (str(run), dict(last)):
                 self._ended(run, last)
             case _:

@@ -71,26 +71,29 @@ class Worker:
                 command = self._pipe.recv()
             except (EOFError, OSError):
                 command = ("quit",)
-            match command[0]:
-                case "stop" | "quit":
+            match command:
+                case ("stop", int(number)):
+                    self._tell("reply", number, self._stop())
+                    continue
+                case ("quit",):
                     self._stop()
-                case "run":
+                case ("run", *_):
                     self._abort.clear()  # here, in the order of the pipe: a stop sent after this run must find it
-            if command[0] != "stop":
-                self._commands.put(command)
-            if command[0] == "quit":
+            self._commands.put(command)
+            if command == ("quit",):
                 return
 
-    def _stop(self) -> None:
+    def _stop(self) -> Problem | None:
+        """Ends what runs and makes the motors safe at once, whatever the working thread is doing."""
         self._abort.set()
         rig = self._rig
-        if rig is not None:
-            try:
+        try:
+            if rig is not None:
                 rig.safe()
-            except Exception:
-                log.exception("the rig could not be made safe")
-                return
-        self._tell("safe")
+        except Exception:
+            log.exception("the rig could not be made safe")
+            return Problem("rig.stop_not_confirmed")
+        return None
 
     # --- the working thread ------------------------------------------------------------------------------------
     def _open(self) -> None:
@@ -153,11 +156,11 @@ class Worker:
     def _answer(self, number: int, work: Callable[[], None]) -> None:
         try:
             work()
-            answer: object = None
+            refusal = None
         except Problem as problem:
-            answer = problem
+            refusal = problem
         self._tell("rig", self._status())
-        self._tell("reply", number, answer)
+        self._tell("reply", number, refusal)
 
     def _tell(self, kind: str, *content: object) -> None:
         with self._telling, suppress(OSError):  # without a server there is nobody to tell; the run goes on

@@ -17,6 +17,7 @@ class Server:
     """`gyrobench serve` on a free port; `address` once it has printed it."""
 
     def __init__(self, data: Path, *options: str) -> None:
+        self.data = data
         command = [sys.executable, "-m", "server.cli", "serve", "--port", "0", "--data", str(data), *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, encoding="utf-8")
         assert self.process.stdout is not None

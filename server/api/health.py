@@ -16,9 +16,11 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
     version: str = __version__
     worker: Literal["ready", "starting", "dead"]
+    worker_pid: int | None
     uptime_s: float
 
 
 @router.get("/health")
 async def health(here: Here) -> Health:
-    return Health(worker=here.supervisor.status, uptime_s=round(time.monotonic() - here.started, 3))
+    uptime = round(time.monotonic() - here.started, 3)
+    return Health(worker=here.supervisor.status, worker_pid=here.supervisor.pid, uptime_s=uptime)

@@ -79,7 +79,9 @@ def give_back(here: Here, lease: LeaseToken = None) -> Response:
     return Response(status_code=204)
 
 
-@router.post("/stop", status_code=204, summary="Emergency stop: no body, no token, never locked")
+@router.post(
+    "/stop", status_code=204, summary="Emergency stop: no body, no token, never locked", responses=declared(503)
+)
 async def stop(here: Here) -> Response:
     await run_in_threadpool(here.supervisor.stop)
     return Response(status_code=204)

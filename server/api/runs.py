@@ -70,8 +70,7 @@ def start(body: models.RunBody, here: Here, lang: Language, lease: LeaseToken = 
 
     here.lease.check(lease)
     bench = here.supervisor
-    with bench.claim():
-        bench.check_free()
+    with bench.free():
         speed = bench.speed if body.speed is None else checked_speed(body.speed, bench.url)
         filled, made = _planned(here, body)
         run = create(here.store, filled, made, rig=bench.url, speed=speed)
@@ -93,7 +92,7 @@ def one(run: str, here: Here, lang: Language) -> models.Run:
     return shown(here.store.runs.get(run), lang)
 
 
-@router.post("/{run}/stop", summary="Stop a run; the motors are left safe", responses=declared(404, 409))
+@router.post("/{run}/stop", summary="Stop a run; the motors are left safe", responses=declared(404, 409, 503))
 def stop(run: str, here: Here, lang: Language) -> models.Run:
     here.store.runs.get(run)
     here.supervisor.stop_run(run)
