@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core.gyro_models import GyroModel
 from calib_core.twin import Plant, board_truth
 from server.emulators import process
 
@@ -75,10 +76,10 @@ class Handler:
                 servo.spec = replace(servo.spec, supply_V=volts)
 
     # --- gyro and DAQ ------------------------------------------------------------------------------------------
-    def mount(self, board: str) -> None:
+    def mount(self, board: str, gyro_model: GyroModel) -> None:
         """Put this board's gyro on the table, the same as the twin with this seed has."""
         with self._lock:
-            self._plant.mount(board_truth(self._seed, board))
+            self._plant.mount(board_truth(self._seed, board, gyro_model))
 
     def unplug_gyro(self, unplugged: bool = True) -> None:
         self._unplugged = unplugged
