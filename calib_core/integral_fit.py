@@ -81,7 +81,7 @@ def fit(recording: Recording, axis: str, *, mask: Mask | None = None) -> Fit:
     """Fits bias, scale factor and the gyro's delay to the rows of ``recording`` in ``mask`` (n,).
 
     The reference is a stationary header, a rate column, or the encoder, in this order. Raises Problem
-    ``fit.too_short`` or ``fit.no_reference``.
+    ``fit.too_short``, ``fit.stuck`` or ``fit.no_reference``.
     """
     design = Design.of(recording, axis, mask)
     solution = design.solve()
@@ -106,9 +106,9 @@ class Design:
         gyro = samples(recording, axis, mask)
         rate = recording.reference_rate(axis)
         if rate is not None:
-            rows, averages, mean = with_reference(gyro, rate)
+            rows, averages, mean = with_reference(gyro, axis, rate)
             return cls(rows, averages, mean, "stationary" if recording.stationary else "rate")
-        rows, averages, readings = with_encoder(gyro, *recording.position(axis))
+        rows, averages, readings = with_encoder(gyro, axis, *recording.position(axis))
         rate = _slopes(rows, readings.angle_deg)
         return cls(rows, averages, rate, "encoder", readings)
 
@@ -138,7 +138,7 @@ class Design:
 
     def solve(self) -> "Solution":
         """Noise and parameters by turns, the delay taken out as it is found and the codes read ever more sharply."""
-        design, delay, values = self, 0.0, self._rough()
+        design, delay, values = self, 0.0, self.rough()
         y = self.output(delay)
         start = RowNoise(first_guess(self.rows, y), reading_deg=self._reading_noise(y, values))
         step = self.readings.step_deg if self.readings is not None else 0.0
@@ -170,7 +170,7 @@ class Design:
         others = np.delete(columns, 1, axis=1)
         return fit_noise(self.rows, y - columns[:, 1] * values[1], others, float(values[1]), start, near)
 
-    def _rough(self) -> F64:
+    def rough(self) -> F64:
         """Parameters (p,) from the integrals by plain least squares, to start from."""
         y, dt = self.output(0.0), self.rows.dt_s
         if not self.moves:
@@ -226,7 +226,7 @@ class Design:
             x, residual = white[:, :-1], white[:, -1] - white[:, :-1] @ values
             if self.readings is not None and len(values) > 1:
                 pull = rows.to_readings(whitener.precision_times(residual))
-                shared[1] = scale_factor * float(rows.reading_variance @ pull**2)
+                shared[1] = scale_factor * float((rows.reading_variance + noise.reading_deg**2) @ pull**2)
             q, root = _factors(x)
             step = root @ (q.T @ residual + root.T @ shared)
             values, covariance = values + step, root @ root.T

@@ -25,6 +25,8 @@ Operator = Any  # a scipy.sparse matrix
 REGULAR = 0.01
 """Relative variance added to each row's white noise, for what the trapezoid rule leaves out."""
 DELAY_GRID_S = 2e-4
+LEAST = 8
+"""Samples below which nothing can be fitted."""
 GAP = 2.5
 """A gap of more than this many sampling intervals interrupts the record."""
 
@@ -157,14 +159,16 @@ def _gradient(time_s: F64) -> Operator:
 
 
 def samples(recording: Recording, axis: str, mask: Mask | None = None) -> Samples:
-    """The gyro's samples in ``mask`` (rows of the recording); raises Problem ``fit.too_short`` under eight."""
+    """The gyro's samples in ``mask`` (rows of the recording); raises Problem ``fit.too_short``, ``fit.stuck``."""
     gyro = recording.gyro(axis)
     there = np.isfinite(gyro.values)
     if mask is not None:
         there &= mask
     index = np.flatnonzero(there)
-    if len(index) < 8:
-        raise Problem("fit.too_short", axis=axis, samples=len(index), least=8)
+    if len(index) < LEAST:
+        raise Problem("fit.too_short", axis=axis, samples=len(index), least=LEAST)
+    if np.ptp(gyro.values[index]) == 0.0:
+        raise Problem("fit.stuck", axis=axis, value=float(gyro.values[index[0]]), unit=gyro.unit)
     time = recording.time_s[index] + gyro.delay_s
     step = np.diff(time)
     interval = float(np.median(step))
@@ -173,12 +177,12 @@ def samples(recording: Recording, axis: str, mask: Mask | None = None) -> Sample
     return Samples(gyro.unit, time, gyro.values[index], start, interval, average, index)
 
 
-def with_reference(s: Samples, rate_dps: F64) -> tuple[Rows, Averages, F64]:
+def with_reference(s: Samples, axis: str, rate_dps: F64) -> tuple[Rows, Averages, F64]:
     """One row per sample that has a reference rate (all rows of the recording given): rows, averages, rate (n,)."""
     rate = rate_dps[s.index]
     at = np.flatnonzero(np.isfinite(rate))
-    if len(at) < 8:
-        raise Problem("fit.too_short", axis="", samples=len(at), least=8)
+    if len(at) < LEAST:
+        raise Problem("fit.too_short", axis=axis, samples=len(at), least=LEAST)
     n, none = len(at), np.full(len(at), -1)
     time = s.time_s[at]
     start = np.diff(time, prepend=-np.inf) > GAP * s.interval_s
@@ -186,7 +190,7 @@ def with_reference(s: Samples, rate_dps: F64) -> tuple[Rows, Averages, F64]:
     return rows, Averages(s, time, time, at), rate[at]
 
 
-def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, encoder_noise.Readings]:
+def with_encoder(s: Samples, axis: str, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, encoder_noise.Readings]:
     """Rows between encoder readings, one per sample inside rests; and the readings used, a rest's as one.
 
     ``time_s``, ``angle_deg`` (m,) are all readings of the recording; those outside the samples' stretches are left out.
@@ -199,7 +203,7 @@ def with_encoder(s: Samples, time_s: F64, angle_deg: F64) -> tuple[Rows, Average
     inside = (time >= first[k]) & (time <= last[k]) & np.append(True, np.diff(time) > 0)
     time, angle, k = time[inside], angle[inside], k[inside]
     if len(time) < 3:
-        raise Problem("fit.no_reference", readings=len(time))
+        raise Problem("fit.no_reference", axis=axis)
     readings = encoder_noise.inspect(time, angle)
 
     # One reading for each moving reading, one for each rest.
