@@ -143,12 +143,13 @@ def dumps(value: object) -> str:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+ID_PATTERN = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+CURSOR_PATTERN = "^[0-9]{1,15}$"
 
 
 def checked_id(value: str, what: str) -> str:
     """An id as a person types it: it ends up in file names and addresses. Raises Problem ``<what>.characters``."""
-    if not _ID.fullmatch(value):
+    if not re.fullmatch(ID_PATTERN[1:-1], value):
         raise Problem(f"{what}.characters", given=value[:80])
     return value
 
@@ -164,7 +165,7 @@ def page(
     """Rows newest first, at most ``limit``, and the cursor of the next page; ``select`` names rowid as "at"."""
     conditions, values = list(where), list(parameters)
     if cursor is not None:
-        if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 16):
+        if not re.fullmatch(CURSOR_PATTERN[1:-1], cursor):
             raise Problem("request.cursor", given=cursor)
         conditions.append("rowid < ?")
         values.append(int(cursor))

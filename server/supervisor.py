@@ -98,10 +98,13 @@ class Supervisor:
         return self._store.runs.get(run)["status"] in ENDED
 
     def open_rig(self, url: str, speed: float) -> None:
-        """Changes the rig; raises Problem where it does not open, and the worker is then without one."""
+        """Changes the rig; raises Problem where the address names none, or where a part of it does not answer."""
         with self.free():
-            self.url, self.speed = url, speed
-            self._ask("open", url)
+            try:
+                self._ask("open", url)
+            finally:
+                if self.url == url:  # as the worker said before it replied
+                    self.speed = speed
 
     def check_rig(self) -> None:
         with self.free():
@@ -212,7 +215,7 @@ class Supervisor:
                 if run in self.live:
                     self.live[run].feed(*decode(data))
             case "rig", (dict(status),):
-                self.rig = status
+                self.rig, self.url = status, status["url"]
                 self._ready.set()
             case "reply", (int(number), refusal):
                 reply = self._replies.get(number)

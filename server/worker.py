@@ -8,7 +8,6 @@ import logging
 import os
 import queue
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
@@ -46,7 +45,7 @@ class Worker:
         """Makes the motors safe, says what answers, then does what it is told until it is told to quit."""
         threading.Thread(target=self._listen, name="listener", daemon=True).start()
         with suppress(Problem):
-            self._open()
+            self._open(self._url)
         self._tell("rig", self._status())
         try:
             while True:
@@ -56,10 +55,9 @@ class Worker:
                     case ("run", str(run), float(speed)):
                         self._run(run, speed)
                     case ("open", int(number), str(url)):
-                        self._url = url
-                        self._answer(number, self._open)
+                        self._answer(number, url)
                     case ("check", int(number)):
-                        self._answer(number, self._open)
+                        self._answer(number, self._url)
         finally:
             self._close()
             self._store.close()
@@ -96,18 +94,23 @@ class Worker:
         return None
 
     # --- the working thread ------------------------------------------------------------------------------------
-    def _open(self) -> None:
-        """Connects the rig at the address in use, motors safe first. Raises Problem where a part does not answer."""
+    def _open(self, url: str) -> None:
+        """Connects the rig at an address, motors safe first.
+
+        Raises Problem: for an address that names no rig, and the old one stays; for a part that does not answer, and
+        the new one shows which.
+        """
         from server.devices import open_rig
 
+        rig = open_rig(url)
         self._close()
-        self._rig = open_rig(self._url)
-        self._rig.open()
-        self._rig.safe()
+        self._rig, self._url = rig, url
+        rig.open()
+        rig.safe()
 
     def _opened(self) -> "Rig":
         if self._rig is None:
-            self._open()
+            self._open(self._url)
         assert self._rig is not None
         return self._rig
 
@@ -120,9 +123,9 @@ class Worker:
     def _status(self) -> dict[str, Any]:
         rig = self._rig
         if rig is None:
-            return {"connected": False, "parts": [], "axes": {}}
+            return {"url": self._url, "connected": False, "parts": [], "axes": {}}
         axes = {name: {**vars(axis)} for name, axis in rig.axes.items()}
-        return {"connected": rig.connected, "parts": rig.status(), "axes": axes}
+        return {"url": self._url, "connected": rig.connected, "parts": rig.status(), "axes": axes}
 
     def _run(self, run: str, speed: float) -> None:
         from server.conduct import conduct
@@ -153,9 +156,9 @@ class Worker:
                 return
             done.wait(FRAME_S)
 
-    def _answer(self, number: int, work: Callable[[], None]) -> None:
+    def _answer(self, number: int, url: str) -> None:
         try:
-            work()
+            self._open(url)
             refusal = None
         except Problem as problem:
             refusal = problem

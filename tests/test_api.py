@@ -260,6 +260,8 @@ def test_own_gyro_models_are_kept_and_presets_stay(server: Server) -> None:
 def test_a_rig_that_is_not_there_is_refused_and_the_old_address_comes_back(server: Server) -> None:
     absent = server.client.put("/rig", json={"url": "dynamixel:/dev/none?ids=1,2&baud=1000000+nidaq:Dev1"})
     problem(absent, 502, "rig.port_absent")
+    problem(server.client.put("/rig", json={"url": "nothing"}), 422, "rig.address")
+    assert server.client.get("/rig").json()["url"] == "twin:", "a refused address left its mark"
     problem(server.client.put("/rig", json={"url": "emulated:", "speed": 20}), 422, "rig.speed_only_simulated")
     back = server.client.put("/rig", json={"url": "twin:?seed=3", "speed": "max"}).json()
     assert (back["connected"], back["simulated"], back["speed"]) == (True, True, "max")

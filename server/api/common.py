@@ -11,6 +11,7 @@ from server.compute import Compute
 from server.lease import Lease
 from server.settings import Settings
 from server.store import Store
+from server.store_db import CURSOR_PATTERN
 from server.supervisor import Supervisor
 
 
@@ -47,5 +48,7 @@ def _language(connection: HTTPConnection) -> str:
 Here = Annotated[Services, Depends(_services)]
 Language = Annotated[str, Depends(_language)]
 Limit = Annotated[int, Query(ge=1, le=200, description="at most so many")]
-Cursor = Annotated[str | None, Query(max_length=20, description="`next` of the page before")]
+Cursor = Annotated[
+    str | None, Query(description="`next` of the page before", json_schema_extra={"pattern": CURSOR_PATTERN})
+]
 Search = Annotated[str, Query(max_length=100, description="what to look for")]

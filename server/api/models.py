@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from calib_core.problem import Problem
-from server.store_db import checked_id
+from server.store_db import ID_PATTERN, checked_id
 
 Axis = Literal["x", "z"]
 StateName = Literal["estimate_x", "rate_x", "position_x", "estimate_z", "rate_z", "position_z"]
@@ -28,10 +28,13 @@ def _model(text: str) -> str:
     return checked_id(text, "gyro_model")
 
 
-Line = Annotated[str, Field(max_length=200), AfterValidator(_one_line)]
+# Patterns are told in OpenAPI and refused in our own words.
+_LINE = Field(json_schema_extra={"pattern": r"^[^\x00-\x1f\x7f]*$"})
+_ID = Field(json_schema_extra={"pattern": ID_PATTERN})
+Line = Annotated[str, Field(max_length=200), _LINE, AfterValidator(_one_line)]
 Note = Annotated[str, Field(max_length=2000)]
-BoardId = Annotated[str, AfterValidator(_board)]
-ModelId = Annotated[str, AfterValidator(_model)]
+BoardId = Annotated[str, _ID, AfterValidator(_board)]
+ModelId = Annotated[str, _ID, AfterValidator(_model)]
 Speed = Annotated[float, Field(ge=1, le=1000)] | Literal["max"]
 
 
@@ -248,12 +251,12 @@ class Verified(Answer):
 
 # --- rig -------------------------------------------------------------------------------------------------------
 class RigBody(Body):
-    url: Annotated[str, Field(min_length=1, max_length=400), AfterValidator(_one_line)]
+    url: Annotated[str, Field(min_length=1, max_length=400), _LINE, AfterValidator(_one_line)]
     speed: Speed | None = None
 
 
 class LeaseBody(Body):
-    holder: Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_one_line)]
+    holder: Annotated[str, Field(min_length=1, max_length=80), _LINE, AfterValidator(_one_line)]
 
 
 class Lease(BaseModel):
