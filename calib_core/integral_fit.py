@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 SUFFIX = {"V": "V", "deg/s": "dps", "counts": "counts"}
 ROUNDS = 3
 """Rounds over the codes; a fourth moves S by less than a hundredth of its uncertainty."""
+CHI2_MEDIAN = 0.455
+"""Median of the square of a standard normal variable."""
 ENOUGH = 1e-3
 """A step, in standard uncertainties, that no longer matters."""
 SOFTEST = 0.5
@@ -182,12 +184,17 @@ class Design:
         return np.array([bias + y.mean(), scale_factor, 0.0])
 
     def _reading_noise(self, y: F64, values: F64) -> float:
-        """deg, beyond the step's own: from row to row the gyro hardly wanders, so the differences are the readings'."""
+        """deg, beyond the step's own. From row to row the gyro hardly wanders, so what differs is the readings' doing;
+        so are, at most, their distances from the straight line through their neighbours (a deaf gyro tells nothing)."""
         if self.readings is None or len(values) == 1:
             return 0.0
         moving = self.rows.after >= 0
         error = ((y - values[0]) / values[1] - self.rate)[moving] * self.rows.dt_s[moving]
-        excess = float(np.mean(error**2)) / 2.0 - self.readings.step_deg**2 / 12.0
+        time, angle = self.readings.time_s, self.readings.angle_deg
+        share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+        bend = angle[1:-1] - (1.0 - share) * angle[:-2] - share * angle[2:]
+        most = np.median(bend**2 / (1.0 + share**2 + (1.0 - share) ** 2)) / CHI2_MEDIAN
+        excess = min(float(np.mean(error**2)) / 2.0, float(most)) - self.readings.step_deg**2 / 12.0
         return float(np.sqrt(max(excess, 0.0)))
 
     def _at(self, sites: Sites) -> "Design":

@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 Operator = Any  # a scipy.sparse matrix
 
 REGULAR = 0.01
-"""Relative variance added to each row's white noise, for what the trapezoid rule leaves out."""
+"""By how much a row's own white noise exceeds what it shares with its neighbours, at least."""
 DELAY_GRID_S = 2e-4
 LEAST = 8
 """Samples below which nothing can be fitted."""
@@ -257,14 +257,11 @@ def _white(s: Samples, begin_s: F64, end_s: F64, at: Ints, start: Mask) -> tuple
 
     own, next_ = np.ones(len(at)), np.zeros(len(at))
     moving = at < 0
-    scale = s.interval_s / (end_s - begin_s)[moving]
-    own[moving] = spread(begin_s[moving], end_s[moving]) * scale**2
-    chained = np.flatnonzero(moving[:-1] & moving[1:] & ~start[1:])
-    a, b = chained, chained + 1
-    both = spread(begin_s[a], end_s[b])
-    scale = s.interval_s**2 / ((end_s - begin_s)[a] * (end_s - begin_s)[b])
-    apart = (own[a] * (end_s - begin_s)[a] ** 2 + own[b] * (end_s - begin_s)[b] ** 2) / s.interval_s**2
-    next_[a] = (both - apart) / 2.0 * scale
-    # With exact readings at the samples' own times the alternating part would vanish altogether.
-    own[moving] *= 1.0 + REGULAR
-    return own, next_
+    length = np.where(moving, (end_s - begin_s) / s.interval_s, 1.0)
+    own[moving] = spread(begin_s[moving], end_s[moving])
+    a = np.flatnonzero(moving[:-1] & moving[1:] & ~start[1:])
+    next_[a] = (spread(begin_s[a], end_s[a + 1]) - own[a] - own[a + 1]) / 2.0
+    # Rows next but one share a little too, which is left out: dominance keeps the whole positive definite without it.
+    own = np.maximum(own, (1.0 + REGULAR) * (np.abs(next_) + np.append(0.0, np.abs(next_[:-1]))))
+    next_[:-1] /= length[:-1] * length[1:]
+    return own / length**2, next_
