@@ -4,7 +4,7 @@ import secrets
 from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import HTTPConnection, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from calib_core.problem import Problem
@@ -55,13 +55,18 @@ class Guard:
         await self._app(scope, counted, send)
 
 
+def check_origin(connection: HTTPConnection) -> None:
+    """Raises Problem where a browser says that a page from elsewhere asks."""
+    origin = connection.headers.get("origin")
+    if origin and urlsplit(origin).netloc != connection.headers.get("host"):
+        raise Problem("auth.foreign_origin", origin=origin)
+
+
 def check_write(request: Request, token: str | None) -> None:
     """Raises Problem where a write comes from another site's page, or without the token this server asks for."""
     if request.method in READS or request.url.path == ALWAYS_ALLOWED:
         return
-    origin = request.headers.get("origin")
-    if origin and urlsplit(origin).netloc != request.headers.get("host"):
-        raise Problem("auth.foreign_origin", origin=origin)
+    check_origin(request)
     if token is None:
         return
     scheme, _, given = request.headers.get("authorization", "").partition(" ")

@@ -68,10 +68,10 @@ def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, st
 
     with file.open("rb") as opened:
         recording = read(opened, name=name, mapping=mapping)
-    board = board or recording.header.get("board") or "unknown"
     with Store(data) as store:
-        store.boards.ensure(board, gyro_model=recording.header.get("sensor") or "LPY503AL-OUT")
-        return store.recordings.add(recording, board=board, name=name)
+        if board:
+            store.boards.ensure(board)
+        return store.recordings.add(recording, board=board or recording.header.get("board", ""), name=name)
 
 
 def export_recording(data: Path, recording: str, form: str, file: Path) -> None:

@@ -9,6 +9,7 @@ from calib_core.certificate import limits
 from calib_core.problem import Problem
 from calib_core.sequence import Axis, Plan
 from server.store import Store
+from server.store_boards import USUAL_MODEL
 from server.store_db import Row, checked_id
 
 # What a run that repeats some states takes over from the one it continues, unless asked otherwise.
@@ -92,4 +93,4 @@ def _model_of_board(store: Store, board: str) -> str:
     try:
         return str(store.boards.get(board)["gyro_model"])
     except Problem:
-        return "LPY503AL-OUT"
+        return USUAL_MODEL

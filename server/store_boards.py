@@ -7,6 +7,8 @@ from calib_core.gyro_models import PRESETS, GyroModel
 from calib_core.problem import Problem
 from server.store_db import Connection, Row, checked_id, dumps, like, now, page
 
+USUAL_MODEL = "LPY503AL-OUT"
+
 
 class Boards:
     def __init__(self, connection: Connection) -> None:
@@ -36,7 +38,7 @@ class Boards:
             db.table("boards").insert({"id": board, "gyro_model": gyro_model, "note": note, "created_at": now()})
         return self.get(board)
 
-    def ensure(self, board: str, *, gyro_model: str) -> None:
+    def ensure(self, board: str, *, gyro_model: str = USUAL_MODEL) -> None:
         """The board of a run or an upload, made where it is new."""
         checked_id(board, "board")
         with self._at.write() as db:

@@ -10,6 +10,7 @@ from server.store_db import Connection, Row, dumps, like, now, page
 
 SELECT = "select rowid as at, * from runs"
 JSON_COLUMNS = ("request", "plan", "states", "message")
+SEARCHED = ("board", "json_extract(request, '$.operator')", "json_extract(request, '$.note')")
 ENDED = ("finished", "stopped", "failed", "interrupted")
 
 
@@ -54,8 +55,8 @@ class Runs:
     ) -> tuple[list[Row], str | None]:
         where, values = [], []
         if q:
-            where.append("(id = ? or board like ? escape '\\' or request like ? escape '\\')")
-            values += [q, like(q), like(q)]
+            where.append("(id = ? or " + " or ".join(f"{text} like ? escape '\\'" for text in SEARCHED) + ")")
+            values += [q, *[like(q)] * len(SEARCHED)]
         for column, wanted in (("board", board), ("status", status)):
             if wanted:
                 where.append(f"{column} = ?")

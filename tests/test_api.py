@@ -11,6 +11,7 @@ import pytest
 from running import Server
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from calib_core import recording as recordings
 from server.live import decode
@@ -157,6 +158,16 @@ def test_the_socket_of_an_unknown_run_says_so(server: Server) -> None:
         with pytest.raises(ConnectionClosedError):
             socket.recv()
         assert (socket.close_code, "none" in (socket.close_reason or "")) == (4404, True)
+
+
+def test_a_page_of_another_site_cannot_watch(server: Server, run: dict[str, Any]) -> None:
+    address = f"{server.address.replace('http', 'ws')}/api/v1/runs/{run['id']}/live"
+    with connect(address, origin=Origin("http://evil.example")) as socket:
+        with pytest.raises(ConnectionClosedError):
+            socket.recv()
+        assert socket.close_code == 4403
+    with connect(address, origin=Origin(server.address), max_size=None) as socket:
+        assert socket.recv()
 
 
 # --- refusals --------------------------------------------------------------------------------------------------

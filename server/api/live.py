@@ -6,25 +6,30 @@ from contextlib import suppress
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from calib_core.problem import Problem
-from server import texts
+from server import auth, problems, texts
 from server.api.common import Services
 from server.live import LiveRun
 
 router = APIRouter()
-NO_SUCH_RUN = 4404
-IDLE_S = 30.0
 
 
 @router.websocket("/runs/{run}/live")
 async def live(socket: WebSocket, run: str) -> None:
-    """Binary messages as `server.live` describes them, from the run so far to its end; then the socket is closed."""
+    """Binary messages as `server.live` describes them, from the run so far to its end; then the socket is closed.
+
+    A refusal closes it with 4000 and its HTTP status: 4404 is a run that there is not.
+    """
     here: Services = socket.app.state.services
     lang = socket.query_params.get("lang") or texts.negotiate(socket.headers.get("accept-language"))
     await socket.accept()
     try:
+        auth.check_origin(
+            socket
+        )  # the browser's own rules keep pages of other sites from our answers, not from sockets
         watched = here.supervisor.live.get(run) or _from_store(here, run)
     except Problem as problem:
-        await socket.close(NO_SUCH_RUN, texts.sentence(problem, lang)[:120])
+        reason = texts.sentence(problem, lang).encode()[:120].decode(errors="ignore")
+        await socket.close(4000 + problems.status_of(problem), reason)
         return
     with suppress(WebSocketDisconnect, RuntimeError):
         await _follow(socket, watched, lang)
