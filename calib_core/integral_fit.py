@@ -6,6 +6,7 @@ The encoder's error multiplies S, so Σ depends on S and the encoder's column ca
 for by solving the score of r'Σ(S)⁻¹r in full: the plain least-squares S would be biased (errors in variables).
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -14,10 +15,10 @@ from numpy.typing import NDArray
 
 from calib_core.code_likelihood import Sites, path_variance, sharpen
 from calib_core.encoder_noise import Readings
-from calib_core.noise_fit import NoiseFit, first_guess, fit_noise
+from calib_core.noise_fit import MAX_CORRELATION_S, NoiseFit, first_guess, fit_noise
 from calib_core.recording import Recording
 from calib_core.rows import Averages, samples, with_encoder, with_reference
-from calib_core.uncertainty import coverage_factor
+from calib_core.uncertainty import Contribution, coverage_factor
 from calib_core.whitening import RowNoise, Rows, Whitener
 
 F64 = NDArray[np.float64]
@@ -46,6 +47,8 @@ class Fit:
     """(p, p) in the order of ``names``."""
     dof: Mapping[str, float]
     """Effective degrees of freedom of each standard uncertainty: how well the record knows its own noise."""
+    encoder_share: Mapping[str, float]
+    """How much of each variance comes from the encoder's readings; the rest is the gyro's noise."""
     noise: Mapping[str, float | None]
     """``white`` and ``ar1`` in the recording's unit, for one sample; ``white_dps``, ``ar1_dps`` likewise in deg/s (None
     without a scale factor); ``correlation_time_s`` (None where the noise is white)."""
@@ -68,6 +71,13 @@ class Fit:
     def expanded_uncertainty(self, name: str) -> float:
         """Half the 95 % interval of ``name``, from the fit alone."""
         return coverage_factor(self.dof[name]) * self.standard_uncertainty(name)
+
+    def contributions(self, name: str) -> tuple[Contribution, ...]:
+        """The fit's rows in the budget of ``name``; together they have its uncertainty and degrees of freedom."""
+        u, share = self.standard_uncertainty(name), self.encoder_share[name]
+        # The encoder's step is known, so all doubt about u is in the gyro's part: Welch and Satterthwaite backwards.
+        gyro = Contribution("gyro_noise", u * math.sqrt(1.0 - share), "A", dof=self.dof[name] * (1.0 - share) ** 2)
+        return (gyro, Contribution("encoder_step", u * math.sqrt(share))) if share > 0.0 else (gyro,)
 
     @property
     def bias(self) -> float:
@@ -186,7 +196,7 @@ class Design:
     def _reading_noise(self, y: F64, values: F64) -> float:
         """deg, beyond the step's own. From row to row the gyro hardly wanders, so what differs is the readings' doing;
         so are, at most, their distances from the straight line through their neighbours (a deaf gyro tells nothing)."""
-        if self.readings is None or len(values) == 1:
+        if self.readings is None or len(values) == 1 or len(self.readings.time_s) < 3:
             return 0.0
         moving = self.rows.after >= 0
         error = ((y - values[0]) / values[1] - self.rate)[moving] * self.rows.dt_s[moving]
@@ -223,9 +233,7 @@ class Design:
         With r = y - Xb and C the covariance of the encoder's errors in the rate, the score of r'Σ⁻¹r in S is
         x'Σ⁻¹r + S·h'Ch, h = Σ⁻¹r: the second term is what x'Σ⁻¹r owes to the error that x and r share.
         """
-        rows, shared = self.rows, np.zeros(len(values))
-        if self.readings is not None:
-            rows = replace(rows, reading_variance=rows.reading_variance * self.readings.recurrence)
+        rows, shared = self._recurrent(), np.zeros(len(values))
         for _ in range(3):
             scale_factor = values[1] if len(values) > 1 else 0.0
             whitener = Whitener(rows, scale_factor, noise)
@@ -240,6 +248,23 @@ class Design:
             if np.all(np.abs(step) < ENOUGH * np.sqrt(np.diag(covariance))):
                 break
         return values, covariance
+
+    def _recurrent(self) -> Rows:
+        """The rows with each reading's variance as often as its codes recur."""
+        if self.readings is None:
+            return self.rows
+        return replace(self.rows, reading_variance=self.rows.reading_variance * self.readings.recurrence)
+
+    def encoder_share(self, columns: F64, noise: RowNoise, values: F64, covariance: F64) -> F64:
+        """(p,) share of each parameter's variance that the readings' errors bring."""
+        if self.readings is None or len(values) == 1:
+            return np.zeros(len(values))
+        rows = self._recurrent()
+        whitener = Whitener(rows, values[1], noise)
+        white = whitener.whiten(columns) @ covariance
+        pull = np.array([rows.to_readings(whitener.precision_times(column)) for column in white.T])
+        variance = values[1] ** 2 * (rows.reading_variance + noise.reading_deg**2)
+        return np.asarray(np.clip(pull**2 @ variance / np.diag(covariance), 0.0, 1.0))
 
     def chi2(self, y: F64, columns: F64, noise: RowNoise, values: F64, softness: float) -> float:
         """χ² of the residual, the readings taken as the codes' middles with the variance of one reading."""
@@ -288,16 +313,22 @@ def _report(design: Design, solution: Solution) -> Fit:
     elif design.reference == "encoder":
         warnings.append({"code": "fit.nothing_moved", "values": {}})
     p, noise = len(names), solution.noise.noise
+    if noise.ar1 > 0.0 and noise.correlation_time_s >= MAX_CORRELATION_S:
+        warnings.append({"code": "fit.wandering_bias", "values": {"correlation_time_s": MAX_CORRELATION_S}})
     softness = solution.sites.softness if solution.sites else 0.0
     columns = design.columns(solution.delay_s, solution.values)
     chi2 = design.chi2(solution.y, columns, noise, solution.values, softness)
+    if solution.sites is not None:
+        design = design._at(solution.sites)
     dof = _effective_dof(design, solution)
+    share = design.encoder_share(solution.columns, noise, solution.values, solution.covariance)
     s = design.averages.samples
     return Fit(
         names=names,
         values=dict(zip(names, solution.values.tolist(), strict=False)),
         covariance=solution.covariance[:p, :p],
         dof=dict(zip(names, dof.tolist(), strict=False)),
+        encoder_share=dict(zip(names, share.tolist(), strict=False)),
         noise={
             "white": noise.white,
             "ar1": noise.ar1,
@@ -319,8 +350,6 @@ def _report(design: Design, solution: Solution) -> Fit:
 def _effective_dof(design: Design, solution: Solution) -> F64:
     """Satterthwaite: 2·var²/variance(var), by the change of each variance with the noise parameters."""
     h, noise = 0.1, solution.noise
-    if solution.sites is not None:
-        design = design._at(solution.sites)
     variance = np.diag(solution.covariance)
     slope = np.empty((len(variance), len(noise.logarithms)))
     for k, e in enumerate(h * np.eye(slope.shape[1])):

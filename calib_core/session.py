@@ -262,7 +262,7 @@ def _budgets(fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str)
     """
 
     def budget(name: str, fitted: float, adapted: float, *more: Contribution) -> Budget:
-        sources = (Contribution("fit", fit.standard_uncertainty(name), "A", dof=fit.dof[name]), *more)
+        sources = (*fit.contributions(name), *more)
         excluded = EXCLUDED[name]
         if profile != "thesis":
             return Budget(fitted, sources, excluded)

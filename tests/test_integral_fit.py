@@ -9,6 +9,7 @@ from gyro_truth import STEP_DEG, Bench, Board, coloured, moves, recording, thesi
 from calib_core.integral_fit import Fit, fit
 from calib_core.problem import Problem
 from calib_core.recording import Recording
+from calib_core.uncertainty import Budget
 
 BIAS, SCALE = "bias_V", "scale_factor_V_per_dps"
 
@@ -227,3 +228,23 @@ def test_a_stuck_channel_is_refused_and_a_deaf_one_has_no_scale_factor_to_speak_
 def test_the_fit_is_the_same_each_time() -> None:
     r: Recording = Bench(seconds=10.0).board(10).recording
     assert fit(r, "x").values == fit(r, "x").values
+
+
+def test_the_fits_part_of_a_budget_adds_up_to_the_fit() -> None:
+    f = fit(Bench(seconds=40.0).board(11).recording, "x")
+    for name in f.names:
+        budget = Budget(f.values[name], f.contributions(name))
+        assert [c.name for c in budget.contributions] == ["gyro_noise", "encoder_step"]
+        assert budget.standard_uncertainty == pytest.approx(f.standard_uncertainty(name))
+        assert budget.dof == pytest.approx(f.dof[name])
+    loud = fit(Bench(seconds=40.0, noise_V=0.012).board(11).recording, "x")
+    assert loud.encoder_share[SCALE] < 0.3 * f.encoder_share[SCALE]
+    assert 0.01 < f.encoder_share[SCALE] < 0.5
+
+
+def test_a_bias_that_wanders_is_pointed_out() -> None:
+    time = np.arange(12_000) * 0.01
+    rng = np.random.default_rng(1)
+    v = 0.7 + 0.1 * rng.standard_normal(len(time)) + 0.004 * np.cumsum(rng.standard_normal(len(time)))
+    f = fit(recording(time, {"x_gyro_dps": v}, {"reference": "stationary"}), "x")
+    assert [w["code"] for w in f.warnings] == ["fit.wandering_bias"]
