@@ -196,9 +196,9 @@ class NiDaq:
         return self._session
 
     def _stop(self) -> None:
-        from nidaqmx.errors import Error
-
         if self._running and self._session is not None:
+            from nidaqmx.errors import Error
+
             with suppress(Error):
                 self._session.task.stop()
         self._running = False
