@@ -96,8 +96,8 @@ class _Conductor:
             abort=self.abort,
             pace=engine.Pacer(self.speed),
         )
-        with closing(documents):  # the generator's own close makes the rig safe
-            try:
+        try:
+            with closing(documents):  # the rig is safe after it, whatever happens inside
                 for document in documents:
                     match document:
                         case engine.Descriptor():
@@ -110,10 +110,10 @@ class _Conductor:
                             self._analyse(document.state)
                         case engine.Stop():
                             return self._end(document)
-            except Exception:
-                with suppress(Problem):
-                    self._seal()
-                raise
+        except Exception:
+            with suppress(Problem):
+                self._seal()
+            raise
         raise AssertionError("a run ends with a stop")
 
     def _header(self) -> dict[str, str]:

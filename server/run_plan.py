@@ -6,6 +6,7 @@ from typing import Any
 
 from calib_core import sequence, session
 from calib_core.certificate import limits
+from calib_core.gyro_models import GyroModel
 from calib_core.problem import Problem
 from calib_core.sequence import Axis, Plan
 from server.store import Store
@@ -24,6 +25,7 @@ def plan_of(store: Store, request: Mapping[str, Any], axes: Mapping[str, Axis]) 
     board = checked_id(str(request["board"]), "board")
     filled = {name: value for name, value in request.items() if value is not None}
     known: list[str] = []
+    model: GyroModel | None = None
     if continues := filled.get("continues"):
         before = store.runs.get(continues)
         _check_continues(before, board, filled)
@@ -31,6 +33,7 @@ def plan_of(store: Store, request: Mapping[str, Any], axes: Mapping[str, Axis]) 
         filled = {name: inherited.get(name) for name in INHERITED} | filled
         done = [entry["name"] for entry in before["states"] if entry["status"] in ("done", "kept")]
         filled["kept"] = [name for name in done if name not in filled["states"]]
+        model = GyroModel.from_json(before["plan"]["gyro_model"])  # as it was then
         known = [name[-1] for name in filled["kept"] if name.startswith("estimate_")]
     if filled.get("spec") is not None:
         limits(filled["spec"])
@@ -45,7 +48,7 @@ def plan_of(store: Store, request: Mapping[str, Any], axes: Mapping[str, Axis]) 
         states=filled.get("states"),
         readings=filled.get("readings"),
         ranges=filled.get("ranges"),
-        gyro_model=store.gyro_models.get(filled["gyro_model"]),
+        gyro_model=model or store.gyro_models.get(filled["gyro_model"]),
     )
     session.check_states([state.name for state in plan.states], known)
     if axes:
@@ -56,6 +59,9 @@ def plan_of(store: Store, request: Mapping[str, Any], axes: Mapping[str, Axis]) 
 def create(store: Store, filled: Mapping[str, Any], plan: Plan, *, rig: str, speed: float) -> str:
     """A queued run with its empty recording, one that continues another with that one's kept states."""
     kept: list[str] = filled.get("kept", [])
+    before = store.runs.get(filled["continues"]) if kept else {}
+    if kept and before["request"]["rig"] != rig:
+        raise Problem("run.continues_other", name="rig", given=rig, before=before["request"]["rig"])
     request = {**filled, "readings": plan.readings, "rig": rig, "speed": speed if speed < float("inf") else "max"}
     board = request["board"]
     with store.connection.write():
@@ -71,7 +77,6 @@ def create(store: Store, filled: Mapping[str, Any], plan: Plan, *, rig: str, spe
             states=[name for name in sequence.STATES if name in {*kept, *(state.name for state in plan.states)}],
         )
         if kept:
-            before = store.runs.get(filled["continues"])
             store.recordings.copy_states(before["recording"], recording, kept)
             for name in kept:
                 store.runs.set_state(run, name, "kept")

@@ -164,18 +164,29 @@ class Supervisor:
             ours, theirs = context.Pipe()
             arguments = (theirs, str(self._store.data), self.url)
             process = context.Process(target=worker.main, args=arguments, name="gyrobench-worker", daemon=True)
-            process.start()
-            theirs.close()
-            with self._send_lock:
-                self._pipe, self._process = ours, process
             try:
-                while True:
-                    self._received(*ours.recv())
-            except (EOFError, OSError):
-                pass
-            self._gone(process)
+                process.start()
+                theirs.close()
+                with self._send_lock:
+                    self._pipe, self._process = ours, process
+                self._listen(ours)
+                self._gone(process)
+            except OSError:
+                log.exception("the worker could not be started")
             if not self._closing.is_set() and time.monotonic() - born < RESTART_S:
                 self._closing.wait(RESTART_S)  # a worker that dies at once is not started in a tight circle
+
+    def _listen(self, pipe: Connection) -> None:
+        """Takes what the worker says until there is none."""
+        while True:
+            try:
+                said = pipe.recv()
+            except (EOFError, OSError):
+                return
+            try:
+                self._received(*said)
+            except Exception:
+                log.exception("what the worker said could not be taken")
 
     def _gone(self, process: "multiprocessing.process.BaseProcess") -> None:
         self._ready.clear()

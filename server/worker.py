@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from server.live import LiveRun
 
 log = logging.getLogger("gyrobench.worker")
-FRAME_S = 0.05  # twenty frames a second
+LEAST_GAP_S = 0.045  # the engine's blocks are 50 ms apart: each makes a frame, twenty a second
 
 
 def main(pipe: Connection, data: str, url: str) -> None:
@@ -27,6 +27,13 @@ def main(pipe: Connection, data: str, url: str) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the small matrices here are slower with two threads
     with suppress(KeyboardInterrupt):
         Worker(pipe, data, url).serve()
+
+
+def _warm_up() -> None:
+    """Half a second of imports that the end of the first state need not wait for."""
+    import filterpy.kalman  # noqa: F401
+
+    from server import conduct  # noqa: F401
 
 
 class Worker:
@@ -37,6 +44,7 @@ class Worker:
         self._store = Store(data)
         self._url = url
         self._rig: Rig | None = None
+        self._refused: Problem | None = None  # why there is none
         self._commands: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._abort = threading.Event()
         self._telling = threading.Lock()
@@ -47,6 +55,7 @@ class Worker:
         with suppress(Problem):
             self._open(self._url)
         self._tell("rig", self._status())
+        threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
         try:
             while True:
                 match self._commands.get():
@@ -102,7 +111,11 @@ class Worker:
         """
         from server.devices import open_rig
 
-        rig = open_rig(url)
+        try:
+            rig = open_rig(url)
+        except Problem as problem:
+            self._refused = problem
+            raise
         self._close()
         self._rig, self._url = rig, url
         rig.open()
@@ -123,7 +136,9 @@ class Worker:
     def _status(self) -> dict[str, Any]:
         rig = self._rig
         if rig is None:
-            return {"url": self._url, "connected": False, "parts": [], "axes": {}}
+            why = self._refused
+            parts = [{"part": "rig", "ok": False, "code": why.code, "values": why.values}] if why else []
+            return {"url": self._url, "connected": False, "parts": parts, "axes": {}}
         axes = {name: {**vars(axis)} for name, axis in rig.axes.items()}
         return {"url": self._url, "connected": rig.connected, "parts": rig.status(), "axes": axes}
 
@@ -132,21 +147,25 @@ class Worker:
         from server.live import LiveRun
 
         live = LiveRun(run, {"status": "running"})
-        done = threading.Event()
-        sender = threading.Thread(target=self._send_frames, args=(live, done), name="frames")
+        news, done = threading.Event(), threading.Event()
+        live.watch(news.set)
+        sender = threading.Thread(target=self._send_frames, args=(live, news, done), name="frames")
         sender.start()
         try:
             last = conduct(self._store, run, self._opened, speed=speed, abort=self._abort, live=live)
         finally:
             done.set()
+            news.set()
             sender.join()
         self._tell("rig", self._status())
         self._tell("ended", run, last)
 
-    def _send_frames(self, live: "LiveRun", done: threading.Event) -> None:
-        """Sends what is new, at most twenty times a second; a server that is slow to read does not delay the run."""
+    def _send_frames(self, live: "LiveRun", news: threading.Event, done: threading.Event) -> None:
+        """Sends what is new, some twenty times a second; a server that is slow to read does not delay the run."""
         cursor: int | None = None
         while True:
+            news.wait()
+            news.clear()
             last = done.is_set()
             new = live.since(cursor)
             if new is not None:
@@ -154,7 +173,7 @@ class Worker:
                 self._tell("frame", live.run, message)
             if last:
                 return
-            done.wait(FRAME_S)
+            done.wait(LEAST_GAP_S)
 
     def _answer(self, number: int, url: str) -> None:
         try:

@@ -268,15 +268,18 @@ def test_own_gyro_models_are_kept_and_presets_stay(server: Server) -> None:
     problem(server.client.get("/gyro-models/MINE"), 404, "gyro_model.not_found")
 
 
-def test_a_rig_that_is_not_there_is_refused_and_the_old_address_comes_back(server: Server) -> None:
-    absent = server.client.put("/rig", json={"url": "dynamixel:/dev/none?ids=1,2&baud=1000000+nidaq:Dev1"})
-    problem(absent, 502, "rig.port_absent")
+def test_a_rig_that_is_not_there_is_refused(server: Server, run: dict[str, Any]) -> None:
     problem(server.client.put("/rig", json={"url": "nothing"}), 422, "rig.address")
     assert server.client.get("/rig").json()["url"] == "twin:", "a refused address left its mark"
+    absent = {"url": "dynamixel:/dev/none?ids=1,2&baud=1000000+nidaq:Dev1?channels=ai0,ai1"}
+    problem(server.client.put("/rig", json=absent), 502, "rig.port_absent")
+    assert server.client.get("/rig").json()["connected"] is False
     problem(server.client.put("/rig", json={"url": "emulated:", "speed": 20}), 422, "rig.speed_only_simulated")
     back = server.client.put("/rig", json={"url": "twin:?seed=3", "speed": "max"}).json()
     assert (back["connected"], back["simulated"], back["speed"]) == (True, True, "max")
     assert {part["part"]: part["ok"] for part in back["parts"]}["servo x"] is True
+    elsewhere = server.client.post("/runs", json={"board": "LPY-7", "continues": run["id"], "states": ["rate_x"]})
+    problem(elsewhere, 422, "run.continues_other")
     server.client.put("/rig", json={"url": "twin:"})
 
 

@@ -15,12 +15,13 @@ from running import Server
 from shared import ROOT
 
 from server.app import vendored
+from server.auth import new_token
 from server.cli import main
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    running = Server(tmp_path)
+    running = Server(tmp_path, "--rig", "dynamixel:/dev/none?ids=1,2&baud=1000000+nidaq:Dev1")
     yield running
     running.close()
 
@@ -55,7 +56,16 @@ def test_it_prints_its_address_and_serves_pages_scripts_and_fonts(server: Server
     for name, path in vendored().items():
         assert httpx.get(f"{server.address}/vendor/{name}").content == path.read_bytes()
     assert httpx.get(f"{server.address}/vendor/none.js").status_code == 404
-    assert httpx.get(f"{server.address}/../pyproject.toml").status_code == 404
+    assert httpx.get(f"{server.address}/%2e%2e/pyproject.toml").status_code == 404
+
+
+def test_a_rig_that_is_not_there_is_named_on_the_page_and_another_can_be_chosen(server: Server) -> None:
+    refused = server.client.post("/rig/check")
+    assert (refused.status_code, refused.json()["code"]) == (502, "rig.port_absent")
+    shown = server.client.get("/rig").json()
+    assert not shown["connected"]
+    assert any("/dev/none" in part["sentence"] for part in shown["parts"] if part["ok"] is False)
+    assert server.client.put("/rig", json={"url": "twin:"}).json()["connected"]
 
 
 def test_a_port_in_use_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,9 +109,7 @@ def test_outside_the_loopback_every_write_but_the_stop_needs_the_printed_token(t
         assert server.client.post("/rig/stop").status_code == 204
     finally:
         server.close()
-    again = Server(tmp_path, "--host", "0.0.0.0")
-    again.close()
-    assert token not in again.printed[0], "the token is for one time"
+    assert new_token() != token, "the token is for one time"
 
 
 def bearer(token: str) -> dict[str, str]:

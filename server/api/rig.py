@@ -1,16 +1,16 @@
 """The rig: what it is, what answers, who holds it, and the emergency stop."""
 
+import asyncio
 import math
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Response
-from starlette.concurrency import run_in_threadpool
 
 from server import texts
 from server.api import models
 from server.api.common import Here, Language, Services
 from server.problems import declared
-from server.settings import checked_speed, is_simulated
+from server.settings import checked_speed, has_speed
 
 router = APIRouter(prefix="/rig", tags=["rig"])
 LeaseToken = Annotated[str | None, Header(alias="X-Rig-Lease", max_length=200)]
@@ -28,7 +28,7 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
     return {
         "url": bench.url,
         "kind": bench.url.split(":", 1)[0],
-        "simulated": is_simulated(bench.url),
+        "simulated": has_speed(bench.url),
         "speed": "max" if math.isinf(bench.speed) else bench.speed,
         "connected": bool(status.get("connected")),
         "parts": parts,
@@ -83,5 +83,6 @@ def give_back(here: Here, lease: LeaseToken = None) -> Response:
     "/stop", status_code=204, summary="Emergency stop: no body, no token, never locked", responses=declared(503)
 )
 async def stop(here: Here) -> Response:
-    await run_in_threadpool(here.supervisor.stop)
+    # Not in the threads that other requests may have taken all of.
+    await asyncio.to_thread(here.supervisor.stop)
     return Response(status_code=204)
