@@ -11,6 +11,7 @@ from ni_bench import Bench, bench, refused
 from shared import ROOT
 
 from calib_core.problem import Problem
+from server.devices import doctor_daq
 from server.devices.ni_daq import NiDaq
 from server.texts import render
 
@@ -291,7 +292,7 @@ def test_without_nis_driver_the_message_says_what_to_do() -> None:
 def test_every_fault_has_its_sentence_in_both_languages(ni: Bench) -> None:
     from server.devices.ni_faults import BY_CODE, BY_STATUS
 
-    where = ni.daq()._where()
+    where = ni.daq().where()
     for code in {*BY_CODE.values(), *BY_STATUS.values(), "daq.no_driver", "daq.error", "daq.not_open", "rig.stopped"}:
         for lang in ("en", "th"):
             said = render(code, {**where, "number": -1, "said": "."}, lang)
@@ -323,3 +324,45 @@ def test_nis_library_is_not_imported_before_it_is_needed() -> None:
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
     assert result.stdout.strip() == "[]"
+
+
+# --- doctor ----------------------------------------------------------------------------------------------------
+def told(address: str) -> list[tuple[str, bool | None, str]]:
+    found = []
+    for check in doctor_daq.checks(address):
+        said = " ".join(render(code, check.values, "en") for code in (check.code, check.cure) if code)
+        assert "{" not in said
+        found.append((check.name, check.ok, said))
+    return found
+
+
+def test_doctor_says_which_driver_devices_and_volts_there_are(ni: Bench) -> None:
+    driver, samples = told(f"grpc://127.0.0.1:{ni.port}/Dev1?channels=ai0,ai3")
+    assert driver[1]
+    assert "24.8.0" in driver[2]
+    assert "Dev1 (USB-6008)" in driver[2]
+    assert samples[1]
+    assert "ai3 3.00" in samples[2]
+    assert ni.device.shown() == {}
+
+
+def test_doctor_names_the_devices_there_are_where_the_one_asked_for_is_not(ni: Bench) -> None:
+    driver, device = told(f"grpc://127.0.0.1:{ni.port}/Dev3")
+    assert driver[1] is True
+    assert device[1] is False
+    assert "Put one of these names" in device[2]
+    assert "Dev1 (USB-6008)" in device[2]
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("grpc://127.0.0.1:1/Dev1", "start it on that computer"),
+        ("Dev1", "NI gRPC Device Server"),
+        ("?", "not understood"),
+    ],
+)
+def test_doctor_stops_at_the_first_thing_that_is_not_there(address: str, words: str) -> None:
+    (only,) = told(address)
+    assert only[1] is False
+    assert words in only[2]

@@ -187,7 +187,7 @@ class NiDaq:
         piece = np.empty((len(self.inputs), n))
         got = self._reader.read_many_sample(piece, n, timeout=n / RATE_HZ + self._late_s)
         if got != n:  # it would be filled in the wrong places
-            raise DeviceError("daq.late", **self._where())
+            raise DeviceError("daq.late", **self.where())
         return piece
 
     def _opened(self) -> Session:
@@ -211,9 +211,10 @@ class NiDaq:
     def _broken(self, error: Exception) -> DeviceError:
         """After an error of the driver or the server nothing of this task is used again: `open` makes a new one."""
         self._leave(answering=not unreachable(error))
-        return fault(error, **self._where())
+        return fault(error, **self.where())
 
-    def _where(self) -> dict[str, Any]:
+    def where(self) -> dict[str, Any]:
+        """What its sentences say of it."""
         return {
             "part": self.part,
             "device": self.device,

@@ -69,6 +69,21 @@ class Session:
             self._channel.close()
 
 
+def devices(server: str) -> tuple[str, dict[str, str]]:
+    """The driver's version, and every device it knows with its product. Raises `nidaqmx.errors.Error`."""
+    from nidaqmx.grpc_session_options import GrpcSessionOptions
+    from nidaqmx.system import System
+
+    channel = _channel(server) if server else None
+    try:
+        system = System.local() if channel is None else System.remote(GrpcSessionOptions(channel, ""))
+        found = {device.name: device.product_type for device in system.devices}
+        return ".".join(str(part) for part in system.driver_version), found
+    finally:
+        if channel is not None:
+            channel.close()
+
+
 def unreachable(error: Exception) -> bool:
     """Whether this error says that the server is gone or silent."""
     return getattr(getattr(error, "rpc_code", None), "name", "") in UNREACHABLE

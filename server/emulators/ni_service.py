@@ -14,7 +14,7 @@ from server.emulators.ni_driver import NO_ATTRIBUTE, TIMEOUT, DaqmxError, Device
 DRIVER_VERSION = {0x1272: 24, 0x1923: 8, 0x2F22: 0}
 TASK_NAME, TASK_CHANNELS, TASK_DEVICES = 0x1276, 0x1273, 0x230E
 AVAILABLE, CHANNELS = 0x1223, 0x217B
-PRODUCT_TYPE = 0x0631
+PRODUCT_TYPE, DEVICES = 0x0631, 0x193B
 INITIALIZE, ATTACH = 1, 2
 Call = Callable[[Any], Any]
 
@@ -117,6 +117,9 @@ def _calls(device: Device, wire: Any) -> dict[str, Call]:
     return {
         "GetSystemInfoAttributeUInt32": lambda request: wire.GetSystemInfoAttributeUInt32Response(
             value=one_of(DRIVER_VERSION, request)
+        ),
+        "GetSystemInfoAttributeString": lambda request: wire.GetSystemInfoAttributeStringResponse(
+            value=one_of({DEVICES: device.name}, request)
         ),
         "CreateTask": create_task,
         "GetTaskAttributeString": task_text,
