@@ -6,6 +6,7 @@ Every function here is named by the caller and run there; it opens the store by 
 import asyncio
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -59,6 +60,7 @@ class Compute:
 def _begin() -> None:
     # The small matrices of this work are slower with two threads than with one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is the server's; it ends this process in order
 
 
 def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, str] | None, board: str | None) -> str:

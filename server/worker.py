@@ -7,6 +7,7 @@ main thread is busy. The process ends when the pipe does, and leaves the motors 
 import logging
 import os
 import queue
+import signal
 import threading
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -25,8 +26,9 @@ LEAST_GAP_S = 0.045  # the engine's blocks are 50 ms apart: each makes a frame, 
 def main(pipe: Connection, data: str, url: str) -> None:
     """The process. Heavy imports are inside, because the server imports this module too."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the small matrices here are slower with two threads
-    with suppress(KeyboardInterrupt):
-        Worker(pipe, data, url).serve()
+    # Ctrl+C reaches every process of the terminal; ours ends when the server says so, in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Worker(pipe, data, url).serve()
 
 
 def _warm_up() -> None:

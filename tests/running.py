@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import httpx
 from shared import ROOT
@@ -16,10 +16,18 @@ READY_S = 30.0
 class Server:
     """`gyrobench serve` on a free port; `address` once it has printed it."""
 
-    def __init__(self, data: Path, *options: str) -> None:
+    def __init__(self, data: Path, *options: str, stderr: IO[str] | None = None) -> None:
         self.data = data
         command = [sys.executable, "-m", "server.cli", "serve", "--port", "0", "--data", str(data), *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, encoding="utf-8")
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            cwd=ROOT,
+            encoding="utf-8",
+            start_new_session=True,
+        )
         assert self.process.stdout is not None
         self.printed = [self.process.stdout.readline()]
         found = re.search(r"http://\S+:\d+", self.printed[0])

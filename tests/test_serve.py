@@ -1,6 +1,8 @@
 """`gyrobench serve`: quick to answer, honest about its address, closed to strangers."""
 
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from shared import ROOT
 from server.app import vendored
 from server.auth import new_token
 from server.cli import main
+from server.store import Store
 
 
 @pytest.fixture
@@ -116,12 +119,21 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def test_ctrl_c_ends_server_and_worker(tmp_path: Path) -> None:
-    running = Server(tmp_path).worker_ready()
-    worker = psutil.Process(running.client.get("/health").json()["worker_pid"])
-    running.close()
-    psutil.wait_procs([worker], timeout=5)
-    assert not worker.is_running()
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="Ctrl+C is sent another way on this system")
+def test_ctrl_c_ends_a_run_and_every_process_in_order(tmp_path: Path) -> None:
+    with (tmp_path / "errors").open("w+") as errors:
+        running = Server(tmp_path, stderr=errors).worker_ready()
+        run = running.run(speed=20)
+        running.client.get(f"/runs/{run['id']}/comparison", params={"axis": "x"})  # starts the second process too
+        processes = psutil.Process(running.process.pid).children(recursive=True)
+        assert len(processes) >= 2
+        # A terminal sends it to all of them at once.
+        os.killpg(running.process.pid, signal.SIGINT)
+        running.process.wait(10)
+        assert psutil.wait_procs(processes, timeout=5)[1] == []
+        assert (tmp_path / "errors").read_text() == ""
+    with Store(tmp_path) as store:
+        assert store.runs.get(run["id"])["status"] == "stopped"
 
 
 def test_nothing_eager_in_the_server_is_needed_twice() -> None:
