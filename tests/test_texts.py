@@ -16,8 +16,10 @@ SOURCES = sorted([*ROOT.glob("calib_core/**/*.py"), *ROOT.glob("server/**/*.py")
 
 
 def test_both_languages_have_the_same_texts_with_the_same_placeholders() -> None:
+    """Except the cards of effects, whose English is in the effects' own files (test_effect_texts.py)."""
     english, thai = texts.texts("en"), texts.texts("th")
-    assert set(english) == set(thai)
+    cards = {key for key in thai if key.startswith("effects.") and not key.endswith(".name")}
+    assert set(english) == set(thai) - cards
     for key, text in english.items():
         assert set(PLACEHOLDER.findall(text)) == set(PLACEHOLDER.findall(thai[key])), key
         assert text.strip()

@@ -35,7 +35,9 @@ def texts() -> dict[str, dict[str, str]]:
 
 
 def test_english_and_thai_have_the_same_texts(texts: dict[str, dict[str, str]]) -> None:
-    assert sorted(texts["en"]) == sorted(texts["th"])
+    # The English of an effect's card is in the effect's own file.
+    cards = {key for key in texts["th"] if key.startswith("effects.") and not key.endswith(".name")}
+    assert sorted(texts["en"]) == sorted(set(texts["th"]) - cards)
     empty = [f"{language}: {key}" for language, all_ in texts.items() for key, text in all_.items() if not text.strip()]
     assert not empty
 

@@ -1,0 +1,195 @@
+"""What is the model missing, in words: one path from a recording to CONTRACT 3's JSON.
+
+The command, the server and the worker call ``of_recording`` (or ``of_file``) and then ``told``. The first gives
+numbers, codes and values, the same in every language; the second adds their sentences.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib_core.problem import Problem
+from server.texts import render, texts
+
+if TYPE_CHECKING:
+    from calib_core.effects import Effect
+    from calib_core.recording import Recording
+
+Words = dict[str, Any]
+
+CERTAIN, LIKELY = 1e-6, 1e-3
+"""Chances that noise alone gives a finding, over all effects tried."""
+ABOVE_FLOOR = 1.1
+STILL = {"rate": 0.5, "acceleration": 0.5, "other_rate": 0.5}
+"""Below this a covariate is said to stand still."""
+KINDS = {
+    "temperature_c": "temperature", "other_rate_dps": "other_rate", "_acceleration_dps2": "acceleration",
+    "_rate_dps": "rate", "_position_deg": "position", "time_since_reversal_s": "since_reversal",
+    "duration_s": "duration", "time_s": "time", "supply_v": "supply", "frequency_hz": "frequency",
+    "set_point": "set_point",
+}  # fmt: skip
+"""How names of covariates end, and the texts that tell of them."""
+
+
+def of_file(file: Path, *, axis: str | None = None, effects: Sequence[str] = ()) -> list[Words]:
+    """The diagnosis of a recording's file. Raises Problem and OSError."""
+    from calib_core import recording
+
+    with file.open("rb") as opened:
+        return [of_recording(recording.read(opened, name=file.name), axis=axis, effects=effects, file=file.name)]
+
+
+def of_recording(
+    recording: "Recording",
+    *,
+    axis: str | None = None,
+    effects: Sequence[str] = (),
+    file: str | None = None,
+    suspects: "Mapping[str, type[Effect]] | None" = None,
+) -> Words:
+    """CONTRACT 3 for one axis: the one asked for, else the one that the header names, else the first."""
+    from calib_core.effects import library
+    from calib_core.gap import diagnose
+    from calib_core.gap_report import to_json
+
+    pool = dict(library() if suspects is None else suspects)
+    for name in effects:
+        if name not in pool:
+            raise Problem("diagnosis.no_such_effect", given=name, allowed=", ".join(pool))
+    if axis is not None and axis not in recording.axes:
+        raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(recording.axes))
+    named = recording.header.get("axis", "")
+    axis = axis or (named if named in recording.axes else recording.axes[0])
+    answer = to_json(diagnose(recording, axis, effects=effects, suspects=pool))
+    answer["recording"]["file"] = file
+    return explained(answer)
+
+
+def explained(answer: Words) -> Words:
+    """The answer with a code and values for everything that is to be said about its numbers."""
+    tied = {name: names for names in answer["rivals"] for name in names}
+    tested = sum(candidate["status"] == "tested" for candidate in answer["candidates"]) or 1
+    for failure in answer["where_it_fails"]:
+        failure |= _failure(failure)
+    for finding in answer["missing"]:
+        names = tied.get(finding["effect"], [finding["effect"]])
+        finding |= _finding(effect_words(names), min(1.0, finding["p"] * tested))
+    if answer["error"] is not None:
+        answer |= _verdict(answer, tied)
+    return answer | {"limits": list(_limits(answer))}
+
+
+def told(answer: Words, lang: str) -> Words:
+    """The answer with ``sentence`` beside every code, in a language."""
+    said = answer | {"sentence": render(answer["code"], answer["values"], lang)}
+    for part in ("checks", "where_it_fails", "missing", "limits"):
+        said[part] = [row | {"sentence": render(row["code"], row["values"], lang)} for row in answer[part]]
+    following = answer["next_experiment"]
+    if following and "code" in following:
+        said["next_experiment"] = following | {"sentence": render(following["code"], following["values"], lang)}
+    return said
+
+
+def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
+    """The code and values of the one plain sentence."""
+    before, after, floor, unit = errors(answer)
+    findings = [effect_words(tied.get(m["effect"], [m["effect"]])) for m in answer["missing"]]
+    values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": _joined("both", findings)}
+    verdict = answer["verdict"]
+    if verdict == "unknown":
+        values["along"] = along(answer["unknown"]["covariate"])
+        verdict = "unknown_beside" if findings else "unknown"
+    elif verdict == "adequate" and before > ABOVE_FLOOR * floor:
+        verdict = "adequate_above_floor"
+    return {"code": f"diagnosis.{verdict}", "values": values}
+
+
+def errors(answer: Words) -> tuple[float, float, float, str]:
+    """Held-out error of the model asked for and of the one with what it lacks, the noise's part, and their unit."""
+    suffix, unit = ("deg", "deg") if "held_out_rms_deg" in answer["error"] else ("dps", "deg/s")
+    floor = answer["error"][f"floor_rms_{suffix}"]
+    found = (answer["error"][f"held_out_rms_{suffix}"], answer["after"][f"held_out_rms_{suffix}"], floor)
+    before, after, floor = (rounded(x, 0.1 * floor) for x in found)
+    return before, after, floor, unit
+
+
+def _failure(failure: Mapping[str, Any]) -> Words:
+    suffix = "deg" if "residual_deg" in failure else "dps"
+    residual, z = failure[f"residual_{suffix}"], failure["z"]
+    low, high = failure["from"], failure["to"]
+    finest = (high - low) / 5.0
+    ends = {"from": rounded(low, finest), "to": rounded(high, finest)}
+    place = _covariate(failure["covariate"])
+    kind = place.pop("kind")
+    if max(abs(low), abs(high)) < STILL.get(kind, 0.0):
+        kind = "other_still" if kind == "other_rate" else "still"
+    where = {"code": f"diagnosis.where.{kind}", "values": ends | place}
+    size = rounded(float(f"{abs(residual):.2g}"), abs(residual / z) if z else 0.0)
+    side = "reads_low" if residual > 0.0 else "reads_high"
+    unit = "deg" if suffix == "deg" else "deg/s"
+    return {"code": f"diagnosis.{side}", "values": {"size": size, "unit": unit, "where": where}}
+
+
+def _finding(effect: Words, chance: float) -> Words:
+    word = "certain" if chance < CERTAIN else "likely" if chance < LIKELY else "probable"
+    values = {"effect": effect} | ({"odds": _round_number(1.0 / chance)} if word == "likely" else {})
+    return {"code": f"diagnosis.finding.{word}", "values": values}
+
+
+def _limits(answer: Words) -> Iterator[Words]:
+    """What this recording leaves open."""
+
+    def limit(case: str, **values: object) -> Words:
+        return {"code": f"diagnosis.limit.{case}", "values": values}
+
+    for names in answer["rivals"]:
+        yield limit("rivals", rivals=effect_words(names, "both"))
+    if answer["unknown"]:
+        yield limit("unknown")
+    if answer["code"] == "diagnosis.adequate_above_floor":
+        yield limit("above_floor")
+    for status in ("not_excited", "no_data"):
+        names = [c["effect"] for c in answer["candidates"] if c["status"] == status]
+        if names:
+            yield limit(status, effects=[effect_word(name) for name in names])
+
+
+# --- words -------------------------------------------------------------------------------------------------------
+def effect_word(name: str) -> object:
+    """An effect's name in words; a user's own effect has only its own."""
+    key = f"effects.{name}.name"
+    return {"code": key, "values": {}} if key in texts("en") else name
+
+
+def effect_words(names: Sequence[str], joint: str = "either") -> Any:
+    """Names in words, the last after "or" (``either``) or "and" (``both``)."""
+    return _joined(joint, [effect_word(name) for name in names])
+
+
+def _joined(joint: str, words: Sequence[object]) -> Any:
+    if len(words) < 2:
+        return list(words)
+    return {"code": f"diagnosis.{joint}", "values": {"some": list(words[:-1]), "last": words[-1]}}
+
+
+def along(covariate: str) -> Words:
+    """A covariate in words."""
+    place = _covariate(covariate)
+    return {"code": f"diagnosis.along.{place.pop('kind')}", "values": place}
+
+
+def _covariate(name: str) -> Words:
+    kind = next((kind for ending, kind in KINDS.items() if name.endswith(ending)), "other")
+    return {"kind": kind, "axis": name[0], "covariate": name}
+
+
+def rounded(value: float, uncertainty: float) -> float:
+    """``value`` to the first digit of its uncertainty, or to the second where that begins with 1 or 2."""
+    if not (uncertainty > 0.0 and math.isfinite(value)):
+        return float(f"{value:.3g}")
+    return round(value, -math.floor(math.log10(uncertainty / 3.0))) + 0.0
+
+
+def _round_number(value: float) -> int:
+    return int(float(f"{value:.0e}"))
