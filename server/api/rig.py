@@ -17,6 +17,8 @@ LeaseToken = Annotated[str | None, Header(alias="X-Rig-Lease", max_length=200)]
 
 
 def shown(here: Services, lang: str) -> dict[str, Any]:
+    from server.devices.address import ports  # with the drivers it may name, so not with the program
+
     bench = here.supervisor
     status = bench.rig or {}
     parts = [{**part, "sentence": texts.render(part["code"], part["values"], lang)} for part in status.get("parts", ())]
@@ -39,13 +41,6 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
         "choices": choices,
         "worker": bench.status,
     }
-
-
-def ports() -> list[str]:
-    """The serial ports of this computer."""
-    from serial.tools import list_ports
-
-    return sorted(port.device for port in list_ports.comports())
 
 
 @router.get("", summary="What the rig is and what answers")
