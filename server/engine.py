@@ -237,7 +237,8 @@ def _run(
             rig.safe()
         except Exception as error:
             log.exception("run %s: the rig could not be made safe", run_id)
-            outcome = _failed("rig.not_safe", reason=str(error))
+            if outcome["status"] != "failed":  # else the fault that ended the run says what to do
+                outcome = _failed("rig.not_safe", reason=str(error))
     yield Stop(**stamp(), **outcome)
 
 

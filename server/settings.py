@@ -34,19 +34,25 @@ def data_dir(explicit: str | Path | None = None) -> Path:
 
 
 def is_simulated(rig: str) -> bool:
+    """Whether no physical gyro is behind it: the twin, and the emulated bench, which has its port in such a folder."""
+    return rig.startswith(("twin:", "emulated:")) or "gyrobench-emulated-" in rig
+
+
+def has_speed(rig: str) -> bool:
+    """Only the twin runs at another speed than the clock's: everything else has a clock of its own."""
     return rig.startswith("twin:")
 
 
 def checked_speed(speed: str | float | None, rig: str, *, default: float = 20.0) -> float:
     """A speed as the rig allows it; None asks for the rig's own. Raises Problem: only a twin has another than 1."""
     if speed is None:
-        return default if is_simulated(rig) else 1.0
+        return default if has_speed(rig) else 1.0
     try:
         value = math.inf if speed == "max" else float(speed)
     except ValueError:
         value = math.nan
     if math.isnan(value) or not value >= 1:
         raise Problem("rig.speed_unknown", speed=speed)
-    if value != 1 and not is_simulated(rig):
+    if value != 1 and not has_speed(rig):
         raise Problem("rig.speed_only_simulated", speed=speed, rig=rig)
     return value

@@ -2,8 +2,11 @@
 
 import io
 import math
+import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -21,7 +24,8 @@ from server.devices.rig import Rig
 from server.devices.twin_rig import TwinDaq, TwinTable
 from server.engine import record
 
-RIGS = ["twin:?seed=3", "twin:?seed=3&covariates=1"]
+NO_TERMINALS = pytest.mark.skipif(sys.platform == "win32", reason="emulated: needs pseudo-terminals")
+RIGS = ["twin:?seed=3", "twin:?seed=3&covariates=1", pytest.param("emulated:?seed=3", marks=NO_TERMINALS)]
 
 
 @pytest.fixture(params=RIGS)
@@ -81,18 +85,22 @@ def test_safe_works_from_every_state_twice_in_a_row(rig: Rig) -> None:
     let_go()
     rig.begin()
     let_go()
+    with pytest.raises(DeviceError, match=r"rig\.stopped"):  # a stop holds until somebody begins anew
+        rig.start([Move("x", 20.0, 60.0)])
+    rig.begin()
     rig.start([Wave("x", (30.0,), (0.25,), 10.0), Move("z", 100.0, 60.0)])
     rig.read(1.0)
     assert all(servo.torque_on for servo in rig.table.telemetry().values())
     let_go()
-    rig.read(1.0)
-    still = rig.read(1.0).columns
+    rig.begin()
+    still = rig.read(0.5).columns
     assert np.nanmax(still["x_position_deg"]) == np.nanmin(still["x_position_deg"])
     rig.close()
     let_go()
 
 
-def test_an_emergency_stop_from_another_thread_disturbs_nothing(rig: Rig) -> None:
+def test_an_emergency_stop_from_another_thread_disturbs_nothing() -> None:
+    rig = open_rig("twin:?seed=3")
     rig.begin()
     rig.start([Wave("x", (30.0,), (0.25,), 20.0)])
     with ThreadPoolExecutor(1) as pool:
@@ -101,6 +109,20 @@ def test_an_emergency_stop_from_another_thread_disturbs_nothing(rig: Rig) -> Non
             rig.safe()
         assert sum(len(job.result().columns["time_s"]) for job in reading) == 1000
     assert not any(servo.torque_on for servo in rig.table.telemetry().values())
+
+
+def test_an_emergency_stop_ends_a_read_that_is_going_on_and_lets_go_at_once() -> None:
+    with closing(open_rig("emulated:")) as rig, ThreadPoolExecutor(1) as pool:
+        rig.begin()
+        rig.start([Wave("x", (30.0,), (0.25,), 20.0), Move("z", 60.0, 20.0)])
+        reading = pool.submit(rig.read, 5.0)
+        time.sleep(0.3)  # the emulated bench has its own clock
+        began = time.perf_counter()
+        rig.safe()
+        assert time.perf_counter() - began < 0.3
+        assert not any(servo.torque_on for servo in rig.table.telemetry().values())
+        with pytest.raises(DeviceError, match=r"rig\.stopped"):
+            reading.result(2.0)
 
 
 def test_a_wave_waits_for_its_start_and_swings_about_zero() -> None:
@@ -162,7 +184,7 @@ def test_encoder_times_are_true_to_the_least_transfer_time_and_stay_so() -> None
     for _ in range(400):
         columns = rig.read(0.5).columns
         true_s = plant.daq.start_s + columns["time_s"][-1] * (1 + plant.daq.spec.clock_error)
-        mapped = rig._clock.to_daq(np.array([HOST_EPOCH_S + true_s]))[0]
+        mapped = rig.clock.to_daq(np.array([HOST_EPOCH_S + true_s]))[0]
         error_ms.append(1e3 * (mapped - columns["time_s"][-1]))
     assert abs(plant.daq.spec.clock_error * 200) > 0.001  # uncorrected, the clocks part by more than this
     assert np.mean(error_ms) == pytest.approx(-1e3 * plant.daq.spec.transfer_s, abs=0.1)
@@ -307,14 +329,20 @@ def test_safe_tells_both_devices_though_the_first_fails() -> None:
         ("", "rig.address"),
         ("twin", "rig.address"),
         ("twin:elsewhere", "rig.address"),
-        ("twin:?speed=3", "rig.address"),
         ("twin:?seed=-1", "rig.option"),
         ("twin:?seed=", "rig.option"),
         ("serial:/dev/ttyUSB0", "rig.address"),
         ("dynamixel:?ids=1,2", "rig.address"),
-        ("dynamixel:/dev/no-such-port?ids=1,2&baud=1000000+nidaq:Dev1?channels=ai0,ai1", "rig.port_absent"),
-        ("dynamixel:/dev/null?ids=1,2+nidaq:Dev1", "rig.no_driver"),
-        ("emulated:", "rig.no_driver"),
+        ("dynamixel:/dev/ttyUSB0?ids=1,2&baud=1000000", "rig.no_daq"),
+        ("dynamixel:COM3?ids=1,1+nidaq:Dev1", "rig.ids"),
+        ("dynamixel:COM3?ids=1+nidaq:Dev1", "rig.ids"),
+        ("dynamixel:COM3?ids=1,254+nidaq:Dev1", "rig.option"),
+        ("dynamixel:COM3?speed=9+nidaq:Dev1", "rig.unknown_option"),
+        ("dynamixel:COM3?baud=1&baud=2+nidaq:Dev1", "rig.unknown_option"),
+        ("dynamixel:COM3+nidaq:", "daq.address"),
+        ("emulated:here", "rig.address"),
+        ("emulated:?seed=one", "rig.option"),
+        ("twin:?speed=3", "rig.unknown_option"),
     ],
 )
 def test_an_address_that_leads_nowhere_is_refused(url: str, code: str) -> None:
@@ -323,7 +351,16 @@ def test_an_address_that_leads_nowhere_is_refused(url: str, code: str) -> None:
     assert caught.value.code == code
 
 
+def test_an_absent_port_is_found_when_the_rig_is_opened() -> None:
+    with closing(open_rig("dynamixel:/dev/no-such-port?ids=1,2+nidaq:Dev1?channels=ai0,ai1")) as rig:
+        rig.safe()
+        with pytest.raises(DeviceError) as caught:
+            rig.open()
+    assert (caught.value.code, caught.value.values["port"]) == ("rig.port_absent", "/dev/no-such-port")
+
+
 def test_axes_carry_what_the_supply_allows(rig: Rig) -> None:
+    rig.open()
     x, z = rig.axes["x"], rig.axes["z"]
     assert (x.part, z.part) == ("RX-28", "RX-64")
     assert (x.max_rate_dps, z.max_rate_dps) == pytest.approx((326.7, 254.1))

@@ -28,6 +28,7 @@ POLL_S = 0.002  # a read of the port waits this long for bytes: the SDK asks aga
 SPARE_MS = 10.0  # a reply may be this much later than wire and adapter explain: hosts are busy, too
 STAMP_S = 0.003  # a transaction that took this much longer than it has to has no usable time in its middle
 DRAIN_S = 0.05
+BABBLE = 512  # bytes without a packet among them
 WRITE_S = 0.5
 USUAL_LATENCY_MS = 16.0
 FRAME_BYTES = 14  # of a read's request and reply beside the data
@@ -71,6 +72,7 @@ def _port(name: str) -> Any:
 
     class Port(PortHandler):  # type: ignore[misc]
         timer_ms = USUAL_LATENCY_MS
+        heard = 0
 
         def setupPort(self, cflag_baud: int) -> bool:
             super().setupPort(cflag_baud)
@@ -81,13 +83,16 @@ def _port(name: str) -> Any:
             return time.perf_counter() * 1e3  # the SDK's own jumps when somebody sets the clock
 
         def setPacketTimeout(self, packet_length: int) -> None:
+            self.heard = 0
             self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + 2.0 * self.timer_ms + 2.0 + SPARE_MS)
 
         def readPort(self, length: int) -> Any:
             # The SDK looks at its clock only where bytes run out; noise need not.
-            if self.getTimeSinceStart() > self.packet_timeout + SPARE_MS:
+            if self.heard > BABBLE:
                 raise Babble
-            return super().readPort(length)
+            data = super().readPort(length)
+            self.heard += len(data)
+            return data
 
     return Port(name)
 
@@ -151,7 +156,7 @@ class Bus:
         self.good += 1
         return Reply(data, alarm, 0.5 * (began + ended))
 
-    def registers(self, servo: int, address: int, length: int, *, tries: int = 4) -> bytes:
+    def registers(self, servo: int, address: int, length: int, *, tries: int = 20) -> bytes:
         """Registers whose time does not matter, asked for until they come; raises NoReply after the last try."""
         for left in reversed(range(tries)):
             try:

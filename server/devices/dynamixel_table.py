@@ -8,10 +8,13 @@ torque goes off first at every start, on every fault, and once more when a port 
 
 import logging
 import math
+import os
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +51,7 @@ RETRY_S = 0.5  # a port that went away is looked for this often
 OPEN_S, SAFE_S = 8.0, 1.0
 KEEP = 3000  # readings kept for a reader who is late: half a minute
 RESENDS = 5
+URGENT = -10
 FIRST_DPS = 10.0  # speed while a servo takes hold of where it stands
 JUMP_STEPS = 6  # a reading may be this far from where the last and the top speed allow
 JUMPS = 3  # as many wild readings in a row are the truth
@@ -207,6 +211,9 @@ class DynamixelTable:
 
     # --- the owner thread --------------------------------------------------------------------------------------
     def _own(self) -> None:
+        if sys.platform == "linux":
+            with suppress(PermissionError):  # a reading that waits for the host cannot be stamped
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), URGENT)
         try:
             while not self._closing:
                 with self._changed:

@@ -8,6 +8,7 @@ gyro that does not feel the table turn are found here.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -92,15 +93,17 @@ class Rig:
         *,
         simulated: bool = False,
         mount: Callable[[str, GyroModel], None] | None = None,
+        ended: Callable[[], None] | None = None,
     ) -> None:
         self.url, self.table, self.daq, self.simulated = url, table, daq, simulated
         self.connected = False
         self._faults: dict[str, DeviceError] = {}
-        self._mount = mount
+        self._mount, self._ended = mount, ended
+        self._begun, self._starting = False, Lock()
         self._forget()
 
     def _forget(self) -> None:
-        self._clock = ClockRelation()
+        self.clock = ClockRelation()
         self._shafts = {axis: _Shaft() for axis in self.table.axes}
         self._volts: dict[str, float] = {}
         self._now_s = 0.0
@@ -122,6 +125,11 @@ class Rig:
         delays = {f"{name[0]}_gyro_delay_s": f"{i * self.daq.channel_delay_s:g}" for i, name in enumerate(gyros) if i}
         return {"rig": self.url, "gyro_average_s": f"{ROW_S:g}", **delays}
 
+    @property
+    def clock_facts(self) -> dict[str, str]:
+        """What was found of the two clocks since `begin`, for the recording's header."""
+        return {"clock_offset_s": f"{self.clock.offset_s:.6f}", "clock_skew_ppm": f"{1e6 * self.clock.skew:.2f}"}
+
     def open(self) -> None:
         """Connect every part, also of a rig that is open already; raises the first part's `DeviceError`."""
         self._faults = {}
@@ -134,10 +142,12 @@ class Rig:
 
     @contextmanager
     def _asking(self, part: str) -> Iterator[None]:
-        """Remembers that a part did not answer; a fault of one servo names its axis."""
+        """Remembers that a part did not answer; a fault of one servo names its axis, and being stopped is none."""
         try:
             yield
         except DeviceError as fault:
+            if fault.code == "rig.stopped":
+                raise
             self._faults[f"servo {fault.values['axis']}" if "axis" in fault.values else part] = fault
             self.connected = False
             raise
@@ -174,6 +184,9 @@ class Rig:
         if self._faults or not self.connected:
             self.open()
         self._forget()
+        self._begun = True
+        with self._asking("servo"):
+            self.table.read()  # what was read before is of no recording
         self.daq.start()
         self.read(0.1)
         for axis, shaft in self._shafts.items():
@@ -182,13 +195,15 @@ class Rig:
             shaft.from_deg = shaft.seen_deg
 
     def start(self, motions: Sequence[Motion]) -> None:
-        """Begin these motions together, now."""
+        """Begin these motions together, now. Raises `DeviceError`, also where the rig was made safe since `begin`."""
         for motion in motions:
             shaft = self._shafts[motion.axis]
             shaft.from_deg = shaft.commanded_deg(self._now_s)
             shaft.motion, shaft.started_s = motion, self._now_s
             shaft.low_V, shaft.high_V = np.inf, -np.inf
-        with self._asking("servo"):
+        with self._asking("servo"), self._starting:
+            if not self._begun:
+                raise DeviceError("rig.stopped")
             if motions:
                 self.table.start(motions)
 
@@ -210,7 +225,7 @@ class Rig:
         with self._asking("servo"):
             readings = self.table.read()
         self._now_s = float(samples.time_s[-1])
-        self._clock.add(self._now_s, samples.host_time_s)
+        self.clock.add(self._now_s, samples.host_time_s)
         time_s = samples.time_s.reshape(n, MEAN_OF).mean(axis=1)
         volts = samples.volts.reshape(n, MEAN_OF, -1).mean(axis=1)
         columns = {"time_s": np.round(time_s, 6)}
@@ -221,7 +236,7 @@ class Rig:
             fast[name] = np.round(scale * samples.volts[:, i], 6)
         for axis, shaft in self._shafts.items():
             read = readings[axis]
-            shaft.take(self._clock.to_daq(read.time_s), read.angle_deg)
+            shaft.take(self.clock.to_daq(read.time_s), read.angle_deg)
             angle, at = shaft.rows(float(time_s[0]) - ROW_S / 2, n)
             columns[f"{axis}_position_deg"], columns[f"{axis}_position_time_s"] = angle, at
             self._watch(axis, shaft, columns.get(f"{axis}_gyro_v"))
@@ -253,6 +268,8 @@ class Rig:
     def safe(self) -> None:
         """Stop both devices, whatever state they are in; raises the first `DeviceError` after both were told."""
         failed: list[DeviceError] = []
+        with self._starting:
+            self._begun = False
         for shaft in self._shafts.values():
             shaft.motion = None
         for device in (self.table, self.daq):
@@ -270,3 +287,5 @@ class Rig:
             self.table.close()
         finally:
             self.daq.close()
+            if self._ended is not None:
+                self._ended()

@@ -97,6 +97,11 @@ class Handler:
     def daq_spec(self) -> Any:
         return self._plant.daq.spec
 
+    def daq_time_s(self, host_time_s: float) -> float:
+        """What the DAQ's own clock showed at a time of this machine's: the truth that a driver has to find."""
+        daq = self._plant.daq
+        return (host_time_s - self._began_s - daq.start_s) / (1.0 + daq.spec.clock_error)
+
     def daq_start(self) -> None:
         """Sample 0 is taken now."""
         with self._lock:

@@ -13,6 +13,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 from typing import Any
 
@@ -38,6 +40,10 @@ class Child:
     def pid(self) -> int:
         return self._process.pid
 
+    def wait(self) -> None:
+        """Until it ends by itself."""
+        self._process.wait()
+
     def kill(self) -> None:
         """End it at once, as a crash would."""
         self._process.kill()
@@ -57,6 +63,9 @@ class Child:
 def told() -> dict[str, Any]:
     """In an emulator: what its starter said. Ctrl+C is the starter's to handle."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "setpriority"):
+        with suppress(PermissionError):  # a real servo does not wait for a busy computer
+            os.setpriority(os.PRIO_PROCESS, 0, -10)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given: dict[str, Any] = json.loads(sys.argv[1])
     return given
@@ -77,9 +86,7 @@ def serve(handler: object) -> dict[str, str]:
         while True:
             try:
                 connection = listener.accept()
-            except (OSError, EOFError):  # a caller that left while it was greeted, or has not the key
-                continue
-            except Exception:
+            except (OSError, EOFError, AuthenticationError):  # a caller that left at once, or has not the key
                 continue
             threading.Thread(target=_answer, args=[connection, handler], daemon=True).start()
 

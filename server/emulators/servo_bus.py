@@ -68,7 +68,7 @@ class Bus:
     def __init__(self, plant: PlantClient, *, baud: int, latency_s: float, seed: int) -> None:
         self._plant, self._latency_s, self._rng = plant, latency_s, random.Random(seed)
         self._lock = threading.Lock()
-        self._folder = tempfile.TemporaryDirectory(prefix="gyrobench-bus-")
+        self._folder = tempfile.TemporaryDirectory(prefix="gyrobench-emulated-")
         self.port = str(Path(self._folder.name) / "servos")
         number = {part: model for model, part in ((m.number, m.part) for m in MODELS.values())}
         self._servos: dict[int, Servo] = {}
