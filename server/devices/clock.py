@@ -28,7 +28,7 @@ class ClockRelation:
         self._recent: deque[tuple[float, float]] = deque()
         self._origin_s: float | None = None
         self._offset_s = 0.0
-        self._skew = 0.0
+        self.skew = 0.0
 
     def add(self, daq_time_s: float, host_time_s: float) -> None:
         """The sample taken at `daq_time_s` was in the host's hands at `host_time_s`; DAQ times only grow."""
@@ -44,12 +44,17 @@ class ClockRelation:
         recent.append(point)
         while recent[0][0] < daq_time_s - OFFSET_S:
             recent.popleft()
-        self._skew = self._slope()
-        self._offset_s = min(late - self._skew * time for time, late in recent)
+        self.skew = self._slope()
+        self._offset_s = min(late - self.skew * time for time, late in recent)
+
+    @property
+    def offset_s(self) -> float:
+        """The host's clock at the DAQ's zero, up to the least transfer time."""
+        return (self._origin_s or 0.0) + self._offset_s
 
     def to_daq(self, host_time_s: F64) -> F64:
         """DAQ times (n,) of host times (n,)."""
-        return (host_time_s - (self._origin_s or 0.0) - self._offset_s) / (1.0 + self._skew)
+        return (host_time_s - self.offset_s) / (1.0 + self.skew)
 
     def _slope(self) -> float:
         times = [time for time, _ in self._hull]
