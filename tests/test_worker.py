@@ -11,6 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from running import Server
 from websockets.sync.client import connect
@@ -108,7 +109,10 @@ def test_a_killed_worker_loses_no_stored_sample_and_the_next_one_starts(server: 
 def test_a_worker_that_hangs_is_ended_by_the_stop_and_the_operator_is_told(server: Server) -> None:
     run = server.run(speed=20)
     measuring(server, run["id"])
-    os.kill(worker_pid(server), signal.SIGSTOP)
+    worker = psutil.Process(worker_pid(server))
+    worker.send_signal(signal.SIGSTOP)
+    while worker.status() != psutil.STATUS_STOPPED:  # its threads go on until the kernel has stopped each
+        os.sched_yield()
     told = server.client.post("/rig/stop")
     assert (told.status_code, told.json()["code"]) == (503, "rig.stop_not_confirmed")
     assert server.ended(run["id"])["status"] == "interrupted"
