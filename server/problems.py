@@ -1,5 +1,6 @@
 """Every refusal as an RFC 9457 problem document, in the language that was asked for."""
 
+import errno
 import json
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -120,6 +121,12 @@ def install(app: FastAPI) -> None:
             codes.get(error.status_code, "request.unacceptable_request"), method=request.method, path=request.url.path
         )
         return answer(request, problem, error.status_code, **(error.headers or {}))
+
+    @app.exception_handler(OSError)
+    async def system(request: Request, error: OSError) -> JSONResponse:
+        if error.errno == errno.ENOSPC:
+            return answer(request, Problem("store.full", path=str(error.filename or "")))
+        raise error
 
     @app.exception_handler(Exception)
     async def fault(request: Request, error: Exception) -> JSONResponse:
