@@ -119,14 +119,15 @@ class Bus:
         self.close()
         handler = _port(self.port)
         try:
-            if not handler.setBaudRate(self.baud):
-                raise DeviceError("rig.baud", baud=self.baud)
+            known = handler.setBaudRate(self.baud)
             with suppress(AttributeError, OSError, ValueError):  # what is no FTDI adapter on Linux cannot
                 handler.ser.set_low_latency_mode(True)
         except (OSError, TerminalError, ValueError) as error:
             raise _refused(self.port, error) from error
-        known = (self._latency, latency_ms(self.port), USUAL_LATENCY_MS)
-        self.timer_ms = handler.timer_ms = next(timer for timer in known if timer is not None)
+        if not known:
+            raise DeviceError("rig.baud", baud=self.baud)
+        timers = (self._latency, latency_ms(self.port), USUAL_LATENCY_MS)
+        self.timer_ms = handler.timer_ms = next(timer for timer in timers if timer is not None)
         self._handler, self._packets = handler, PacketHandler(1.0)
         self._settled.clear()
 

@@ -23,7 +23,14 @@ SIZE = 50
 EEPROM_END = 24
 OVERLOAD_S = 0.5  # a blocked shaft is let go of after this long
 STUCK_DEG = 1.5
-READ_ONLY = (*range(3), *range(36, 44), 46)
+WORD = (0, CODES)
+RANGES = {  # address: (bytes, lowest, highest) of what may be written (manual, "Control Table Data Range")
+    3: (1, 0, 253), 4: (1, 0, 254), 5: (1, 0, 254), 6: (2, *WORD), 8: (2, *WORD), 11: (1, 0, 150), 12: (1, 50, 250),
+    13: (1, 50, 250), 14: (2, *WORD), 16: (1, 0, 2), 17: (1, 0, 127), 18: (1, 0, 127), 19: (1, 0, 1), 24: (1, 0, 1),
+    25: (1, 0, 1), 26: (1, 0, 254), 27: (1, 0, 254), 28: (1, 1, 254), 29: (1, 1, 254), 30: (2, *WORD), 32: (2, 0, 2047),
+    34: (2, *WORD), 44: (1, 0, 1), 47: (1, 1, 1), 48: (2, *WORD),
+}  # fmt: skip
+WRITABLE = {address + i for address, (width, _, _) in RANGES.items() for i in range(width)}
 
 
 class Instruction(IntEnum):
@@ -32,6 +39,7 @@ class Instruction(IntEnum):
     WRITE = 3
     REG_WRITE = 4
     ACTION = 5
+    RESET = 6
     SYNC_WRITE = 0x83
 
 
@@ -92,6 +100,8 @@ class Servo:
                 error = self.write(*self._waiting)
                 self._waiting = None
                 self.table[Register.REGISTERED] = 0
+            case Instruction.RESET:
+                self.table[:EEPROM_END] = factory(self.table[Register.MODEL])[:EEPROM_END]
             case Instruction.READ | Instruction.WRITE | Instruction.REG_WRITE:
                 error = Alarm.RANGE
             case _:
@@ -102,13 +112,14 @@ class Servo:
         """Registers from `address` on, as one instruction does it; nothing where a value may not be."""
         changed = range(address, address + len(values))
         locked = self.table[Register.LOCK] and address < EEPROM_END
-        if not values or changed.stop > SIZE or locked or any(i in READ_ONLY for i in changed):
+        if not values or locked or not WRITABLE.issuperset(changed):
             return Alarm.RANGE
         after = bytearray(self.table)
         after[address : changed.stop] = values
+        for at, (width, low, high) in RANGES.items():
+            if at in changed and not low <= int.from_bytes(after[at : at + width], "little") <= high:
+                return Alarm.RANGE
         goal = int.from_bytes(after[30:32], "little")
-        if any(int.from_bytes(after[i : i + 2], "little") > CODES for i in (6, 8, 14, 30, 34, 48)):
-            return Alarm.RANGE
         if 30 in changed and not int.from_bytes(after[6:8], "little") <= goal <= int.from_bytes(after[8:10], "little"):
             return Alarm.ANGLE
         was_on = self.table[Register.TORQUE_ENABLE]

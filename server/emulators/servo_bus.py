@@ -140,15 +140,10 @@ class Bus:
             self._servos[servo]._look()
             return bytes(self._servos[servo].table[address : address + length])
 
-    def silence(self, servo: int, new_number: int | None = None) -> None:
-        """The servo leaves the bus (its cable is off), or answers under another number."""
+    def silence(self, servo: int) -> None:
+        """The servo leaves the bus: its cable is off."""
         with self._lock:
-            absent = self._servos.pop(servo)
-            if new_number is not None:
-                absent.table[Register.ID] = new_number
-                self._servos[new_number] = absent
-            else:
-                self._servos[-servo] = absent
+            self._servos[-servo] = self._servos.pop(servo)
 
     def rejoin(self, servo: int) -> None:
         with self._lock:
@@ -189,7 +184,8 @@ class Bus:
             baud = self._baud()
             arrived = seen + (len(parameters) + 6) * 10.0 / baud
             _sleep_until(arrived)
-            heard = {n: s for n, s in self._servos.items() if n > 0 and BAUDS.get(s.table[Register.BAUD]) == baud}
+            there = [servo for place, servo in self._servos.items() if place > 0]
+            heard = {servo.number: servo for servo in there if BAUDS.get(servo.table[Register.BAUD]) == baud}
             if number == BROADCAST:
                 if good:
                     self._broadcast(heard, instruction, parameters)
@@ -202,8 +198,8 @@ class Bus:
             else:
                 if instruction == Instruction.WRITE:
                     self._note(number, parameters)
-                error, data = servo.execute(instruction, parameters)
                 level, delay = servo.table[Register.STATUS_RETURN], servo.table[Register.RETURN_DELAY]
+                error, data = servo.execute(instruction, parameters)
                 if instruction > (Instruction.PING, Instruction.READ, Instruction.SYNC_WRITE)[level]:
                     return arrived
                 reply = status(number, error, data)
