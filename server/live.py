@@ -56,7 +56,7 @@ class LiveRun:
         self._points: list[tuple[int, Any]] = []
         self._results: dict[str, tuple[int, Any]] = {}
         self._encoded: dict[tuple[int | None, str], bytes] = {}
-        self._wakers: dict[object, Callable[[], None]] = {}
+        self._wakers: dict[object, Callable[[], object]] = {}
 
     @property
     def ended(self) -> bool:
@@ -129,7 +129,7 @@ class LiveRun:
         }
         return encode(head, arrays)
 
-    def watch(self, wake: Callable[[], None]) -> Callable[[], None]:
+    def watch(self, wake: Callable[[], object]) -> Callable[[], None]:
         """Calls ``wake`` after each frame, from the feeding thread, until the returned function is called."""
         key = object()
         with self._lock:

@@ -101,7 +101,8 @@ class LiveAnalyser:
         return {f"{self._axis}.{name}": values for name, values in of_rows.items()}
 
     def _every(self, step: int, rows: int) -> npt.NDArray[np.bool_]:
-        return (self._counted + np.arange(rows)) % step == 0
+        chosen: npt.NDArray[np.bool_] = (self._counted + np.arange(rows)) % step == 0
+        return chosen
 
     def _points(self, block: Recording) -> list[dict[str, Any]]:
         """The readings whose stroke has ended with this block."""

@@ -1,5 +1,6 @@
 """The server over HTTP, as a page or a program uses it: one real process, one short run end to end."""
 
+import asyncio
 import errno
 import io
 import json
@@ -8,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from running import Server
-from starlette.testclient import TestClient
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -242,20 +243,29 @@ def test_a_full_disk_is_a_problem_document_and_nothing_is_half_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     app = create_app(Settings(tmp_path))
-    client = TestClient(app)  # without its lifespan: no worker
+
+    def ask(method: str, path: str, **content: Any) -> httpx.Response:
+        """Of the application itself, in this process and without a worker."""
+
+        async def asked() -> httpx.Response:
+            async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
+                return await client.request(method, f"/api/v1{path}", **content)
+
+        return asyncio.run(asked())
+
     store: Store = app.state.services.store
     pages = store.connection.rows("pragma page_count")[0]["page_count"]
     store.connection.db.execute(f"pragma max_page_count = {pages + 1}")
-    answers = [client.post("/api/v1/boards", json={"id": f"B{i}", "note": "n" * 2000}) for i in range(6)]
+    answers = [ask("POST", "/boards", json={"id": f"B{i}", "note": "n" * 2000}) for i in range(6)]
     problem(answers[-1], 507, "store.full")
     made = [answer.json()["id"] for answer in answers if answer.status_code == 201]
-    assert [board["id"] for board in client.get("/api/v1/boards").json()["items"]] == made[::-1]
+    assert [board["id"] for board in ask("GET", "/boards").json()["items"]] == made[::-1]
 
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device", "upload")
 
     monkeypatch.setattr("server.api.recordings.Path.open", full)
-    problem(client.post("/api/v1/recordings", files={"file": ("a.csv", b"time_s")}), 507, "store.full")
+    problem(ask("POST", "/recordings", files={"file": ("a.csv", b"time_s")}), 507, "store.full")
 
 
 def test_too_much_is_refused_while_it_is_read(server: Server) -> None:
