@@ -121,7 +121,7 @@ class GyroModels(BaseModel):
 
 # --- runs ------------------------------------------------------------------------------------------------------
 class Conditions(Body):
-    room_temperature_degC: float | None = Field(None, ge=-60, le=150)
+    room_temperature_degC: float | None = Field(default=None, ge=-60, le=150)
 
 
 class RunBody(Body):
