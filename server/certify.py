@@ -6,7 +6,9 @@ Content depends on the recording (its header included), gyro model, specificatio
 names all four, so that anyone can compute it again; number and day of issue come from the store.
 """
 
+import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from calib_core import session
@@ -57,11 +59,12 @@ def content(
         "board": header.get("board", ""),
         **{name: header.get(name, "") for name in COPIED},
         "gyro_model": found.gyro_model.to_json(),
-        "conditions": _conditions(header),
+        "conditions": _numbers(header, room_temperature_degC="room_temperature_degC"),
         "rig": {
             "url": rig,
             "simulated": is_simulated(rig),
             "reference_calibration": header.get("reference_calibration", ""),
+            "clock": _numbers(header, offset_s="clock_offset_s", skew_ppm="clock_skew_ppm"),
         },
         "profile": found.profile,
         "readings": _readings(found),
@@ -117,12 +120,13 @@ def _same(certified: object, computed: object) -> bool:
     return certified == computed
 
 
-def _conditions(header: Mapping[str, str]) -> dict[str, float]:
-    given = header.get("room_temperature_degC", "")
-    try:
-        return {"room_temperature_degC": float(given)}
-    except ValueError:
-        return {}
+def _numbers(header: Mapping[str, str], **names: str) -> dict[str, float]:
+    """Those of the header's lines that are numbers, under our names."""
+    found = {}
+    for name, line in names.items():
+        with suppress(ValueError):
+            found[name] = float(header.get(line, ""))
+    return {name: value for name, value in found.items() if math.isfinite(value)}
 
 
 def _readings(found: session.Session) -> int | None:

@@ -225,7 +225,7 @@ class _Conductor:
             return
         for state in states:
             self.store.recordings.compact(self.recording, state)
-        self.store.recordings.set_header(self.recording, {"finished_at": now()})
+        self.store.recordings.set_header(self.recording, {"finished_at": now(), **self.rig.clock_facts})
         self.store.recordings.seal(self.recording, self.store.recording(self.recording))
 
     def _show(self, **message: Any) -> None:

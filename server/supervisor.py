@@ -44,6 +44,7 @@ class Supervisor:
         self._started = False
         self.url, self.speed = settings.rig, settings.speed
         self.rig: dict[str, Any] | None = None  # what the worker last said of its rig
+        self.checking = False
         self.run: str | None = None
         self.live: dict[str, LiveRun] = {}
 
@@ -90,6 +91,8 @@ class Supervisor:
             # A run whose end is stored is over; that its worker says so too takes a moment more.
             if run is not None and not (self._stored_end(run) and self._idle.wait(CONFIRMED_S)):
                 raise Problem("run.busy", run=run)
+            if self.checking:
+                raise Problem("rig.checking")
             if not self._ready.wait(REPLY_S):
                 raise Problem("worker.not_ready")
             yield
@@ -109,6 +112,14 @@ class Supervisor:
     def check_rig(self) -> None:
         with self.free():
             self._ask("check")
+
+    def start_check(self, gyro_model: dict[str, Any]) -> None:
+        """Begins the check of the rig's physics; what it finds comes with the rig's status."""
+        with self.free():
+            self.checking = True
+            if not self._send("start_check", gyro_model):
+                self.checking = False
+                raise Problem("worker.not_ready")
 
     def stop(self) -> None:
         """Stops whatever moves and waits until the worker says that the motors are safe.
@@ -198,7 +209,7 @@ class Supervisor:
         if process.is_alive():
             process.kill()
             process.join()
-        self.rig = None
+        self.rig, self.checking = None, False
         for reply in list(self._replies.values()):
             if not reply.done():
                 reply.set_exception(Problem("worker.not_ready"))
@@ -226,7 +237,7 @@ class Supervisor:
                 if run in self.live:
                     self.live[run].feed(*decode(data))
             case "rig", (dict(status),):
-                self.rig, self.url = status, status["url"]
+                self.rig, self.url, self.checking = status, status["url"], status["checking"]
                 self._ready.set()
             case "reply", (int(number), refusal):
                 reply = self._replies.get(number)

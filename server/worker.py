@@ -47,6 +47,8 @@ class Worker:
         self._url = url
         self._rig: Rig | None = None
         self._refused: Problem | None = None  # why there is none
+        self._checks: list[dict[str, Any]] = []
+        self._checking = False
         self._commands: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._abort = threading.Event()
         self._telling = threading.Lock()
@@ -65,6 +67,8 @@ class Worker:
                         return
                     case ("run", str(run), float(speed)):
                         self._run(run, speed)
+                    case ("start_check", dict(model)):
+                        self._check_start(model)
                     case ("open", int(number), str(url)):
                         self._answer(number, url)
                     case ("check", int(number)):
@@ -86,7 +90,7 @@ class Worker:
                     continue
                 case ("quit",):
                     self._stop()
-                case ("run", *_):
+                case ("run" | "start_check", *_):
                     self._abort.clear()  # here, in the order of the pipe: a stop sent after this run must find it
             self._commands.put(command)
             if command == ("quit",):
@@ -119,7 +123,7 @@ class Worker:
             self._refused = problem
             raise
         self._close()
-        self._rig, self._url = rig, url
+        self._rig, self._url, self._checks = rig, url, []
         rig.open()
         rig.safe()
 
@@ -136,13 +140,37 @@ class Worker:
                 rig.close()
 
     def _status(self) -> dict[str, Any]:
-        rig = self._rig
+        rig, checks = self._rig, {"checks": list(self._checks), "checking": self._checking}
         if rig is None:
             why = self._refused
             parts = [{"part": "rig", "ok": False, "code": why.code, "values": why.values}] if why else []
-            return {"url": self._url, "connected": False, "parts": parts, "axes": {}}
+            return {"url": self._url, "connected": False, "parts": parts, "axes": {}, **checks}
         axes = {name: {**vars(axis)} for name, axis in rig.axes.items()}
-        return {"url": self._url, "connected": rig.connected, "parts": rig.status(), "axes": axes}
+        return {"url": self._url, "connected": rig.connected, "parts": rig.status(), "axes": axes, **checks}
+
+    def _check_start(self, model: dict[str, Any]) -> None:
+        """Checks the rig's physics and tells each check as it comes; the table moves."""
+        from calib_core.gyro_models import GyroModel
+        from server.devices import start_checks
+        from server.devices.check import Check
+
+        def found(check: Check) -> None:
+            self._checks.append({"part": check.name, **{k: v for k, v in vars(check).items() if k != "name"}})
+            self._tell("rig", self._status())
+
+        self._checks, self._checking = [], True
+        self._tell("rig", self._status())
+        try:
+            for check in start_checks.run(self._opened(), GyroModel.from_json(model), abort=self._abort):
+                found(check)
+        except Problem as problem:
+            found(Check("rig", False, problem.code, dict(problem.values)))
+        except Exception as error:
+            log.exception("the start-up check")
+            found(Check("rig", False, "server.fault", {"kind": type(error).__name__}))
+        finally:
+            self._checking = False
+            self._tell("rig", self._status())
 
     def _run(self, run: str, speed: float) -> None:
         from server.conduct import conduct

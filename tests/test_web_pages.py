@@ -80,6 +80,16 @@ def test_two_boards_stand_side_by_side(window: Window) -> None:
     assert page.locator("table").count() == 3
 
 
+def test_two_certificates_of_one_board_stand_side_by_side_by_their_numbers(window: Window, server: Server) -> None:
+    number = server.call("GET", "/certificates?board=LPY-A")["items"][0]["number"]
+    page = window.open(f"/compare.html?a={number}&b=LPY-A")
+    page.wait_for_selector("table")
+    assert page.locator("thead").first.inner_text().count(f"{number} x") == 2
+    page.fill("#b", "nobody")
+    page.click("form.compare button")
+    page.wait_for_selector(".error:has-text('nobody')")
+
+
 def test_run_page_shows_results_pictures_and_the_raw_recording(window: Window, server: Server, tmp_path: Path) -> None:
     run = server.call("GET", "/runs?q=LPY-A")["items"][0]["id"]
     page = window.open(f"/run.html?id={run}")
@@ -110,6 +120,17 @@ def test_rig_page_names_every_part_and_its_state(window: Window) -> None:
     page.wait_for_selector(".parts li")
     assert page.locator(".parts li").count() == 4
     assert "RX-28" in window.text(".parts")
+
+
+def test_the_rig_page_checks_the_physics_and_shows_each_check(window: Window, server: Server) -> None:
+    page = window.open("/rig.html")
+    page.click("#start-check")
+    page.wait_for_selector("#physics .parts li:nth-child(8)")
+    said = window.text("#physics .parts")
+    assert "mV/(deg/s)" in said
+    assert "3.18 %" in said
+    rig = server.call("GET", "/rig")
+    server.call("PUT", "/rig", {"url": rig["url"], "speed": rig["speed"]})
 
 
 def test_numbers_show_as_many_digits_as_their_uncertainty_allows(window: Window) -> None:

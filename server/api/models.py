@@ -255,6 +255,10 @@ class RigBody(Body):
     speed: Speed | None = None
 
 
+class StartCheckBody(Body):
+    gyro_model: Annotated[str, Field(min_length=1, max_length=80)] = "LPY503AL-OUT"
+
+
 class LeaseBody(Body):
     holder: Annotated[str, Field(min_length=1, max_length=80), _LINE, AfterValidator(_one_line)]
 
@@ -275,6 +279,7 @@ class Part(BaseModel):
     code: str
     values: dict[str, Any]
     sentence: str
+    cure: str = ""
 
 
 class Rig(Answer):
@@ -284,6 +289,8 @@ class Rig(Answer):
     speed: float | Literal["max"]
     connected: bool
     parts: list[Part]
+    checks: list[Part]
+    checking: bool
     lease: Held | None
     run: str | None
     axes: dict[str, dict[str, Any]]

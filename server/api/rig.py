@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Response
@@ -21,7 +22,6 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
 
     bench = here.supervisor
     status = bench.rig or {}
-    parts = [{**part, "sentence": texts.render(part["code"], part["values"], lang)} for part in status.get("parts", ())]
     found = ports()
     choices = [{"url": "twin:", "label": texts.render("rig.choice.twin", {}, lang)}]
     for port in found:
@@ -33,7 +33,9 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
         "simulated": has_speed(bench.url),
         "speed": "max" if math.isinf(bench.speed) else bench.speed,
         "connected": bool(status.get("connected")),
-        "parts": parts,
+        "parts": [_told(part, lang) for part in status.get("parts", ())],
+        "checks": [_told(check, lang) for check in status.get("checks", ())],
+        "checking": bench.checking,
         "lease": here.lease.shown(),
         "run": bench.run,
         "axes": status.get("axes", {}),
@@ -41,6 +43,13 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
         "choices": choices,
         "worker": bench.status,
     }
+
+
+def _told(part: Mapping[str, Any], lang: str) -> dict[str, Any]:
+    """A part or check with its sentence, and the cure where the sentence has it not."""
+    code, values, cure = part["code"], part["values"], part.get("cure")
+    said = {"sentence": texts.render(code, values, lang), "cure": texts.render(cure, values, lang) if cure else ""}
+    return {**part, **said}
 
 
 @router.get("", summary="What the rig is and what answers")
@@ -60,6 +69,18 @@ def choose(body: models.RigBody, here: Here, lang: Language, lease: LeaseToken =
 def check(here: Here, lang: Language, lease: LeaseToken = None) -> models.Rig:
     here.lease.check(lease)
     here.supervisor.check_rig()
+    return models.Rig(**shown(here, lang))
+
+
+@router.post(
+    "/start-check",
+    status_code=202,
+    summary="Check the rig's physics: the table moves, half a minute; what is found comes with GET rig",
+    responses=declared(404, 409, 503),
+)
+def start_check(body: models.StartCheckBody, here: Here, lang: Language, lease: LeaseToken = None) -> models.Rig:
+    here.lease.check(lease)
+    here.supervisor.start_check(here.store.gyro_models.get(body.gyro_model).to_json())
     return models.Rig(**shown(here, lang))
 
 

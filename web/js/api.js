@@ -60,6 +60,7 @@ export const api = {
   rig: () => call("GET", "/rig"),
   chooseRig: (body) => call("PUT", "/rig", body),
   checkRig: () => call("POST", "/rig/check"),
+  startCheck: (gyro_model) => call("POST", "/rig/start-check", { gyro_model }),
   emergencyStop: () => call("POST", "/rig/stop"),
   async holdRig(holder) {
     const lease = await call("POST", "/rig/lease", { holder });

@@ -2,7 +2,7 @@
 
 import { api } from "../api.js";
 import { facts, h, say, table } from "../dom.js";
-import { rigCard } from "../rig_card.js";
+import { partsList, rigCard } from "../rig_card.js";
 import { page, rigSentence } from "../shell.js";
 import { plain, t } from "../text.js";
 
@@ -10,8 +10,9 @@ page("rig", async (main) => {
   const state = h("p", { class: "muted" });
   const card = h("section", { class: "panel stack" });
   const limits = h("section", { class: "panel stack" });
+  const physics = h("section", { class: "panel stack", id: "physics" });
   const holder = h("section", { class: "panel stack" });
-  main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, limits, holder)));
+  main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, physics, limits, holder)));
   const choose = rigCard(card, { full: true });
 
   const name = h("input", { id: "holder", autocomplete: "name", maxlength: 100 });
@@ -25,12 +26,36 @@ page("rig", async (main) => {
     h("div", { class: "row" }, h("button", { type: "button", onclick: attempt(() => api.holdRig(name.value.trim())) }, t("rig.hold")),
       h("button", { type: "button", onclick: attempt(() => api.releaseRig()) }, t("rig.release"))));
 
+  const model = h("select", { id: "check-model" });
+  const start = h("button", { type: "button", id: "start-check" }, t("rig.start_check"));
+  const wrong = h("p", { class: "error", role: "alert" });
+  const checks = h("div", { "aria-live": "polite" });
+  start.addEventListener("click", async () => {
+    say(wrong, null);
+    try { await api.startCheck(model.value); document.dispatchEvent(new Event("rig-asked")); } catch (problem) { say(wrong, problem); }
+  });
+  physics.append(h("h2", {}, t("rig.physics")), h("p", {}, t("rig.physics_about")),
+    h("div", {}, h("label", { for: "check-model" }, t("rig.model")), model), h("div", { class: "row" }, start), wrong, checks);
+  let shown = "";
+
+  function showChecks(rig) {
+    start.disabled = rig.checking || rig.run != null;
+    start.textContent = t(rig.checking ? "rig.checking" : "rig.start_check");
+    if (JSON.stringify(rig.checks) !== shown) checks.replaceChildren(...(rig.checks.length ? [partsList(rig.checks, true)] : []));
+    shown = JSON.stringify(rig.checks);
+    if (rig.checking) setTimeout(() => document.dispatchEvent(new Event("rig-asked")), 1000);
+  }
+
   document.addEventListener("rig-changed", ({ detail: rig }) => {
     state.textContent = rigSentence(rig);
     choose.show(rig);
+    showChecks(rig);
     told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder }) : t("rig.no_lease");
     limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
       table(["", { n: t("rig.from") }, { n: t("rig.to") }, { n: t("rig.top_speed") }],
         Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: `${plain(a.min_deg)}°` }, { n: `${plain(a.max_deg)}°` }, { n: `${plain(a.max_rate_dps)} deg/s` }]), { label: t("rig.limits") }));
   });
+
+  const { items } = await api.gyroModels();
+  model.replaceChildren(...items.map(({ id, name: words }) => h("option", { value: id }, words)));
 });
