@@ -72,12 +72,16 @@ Motion = Move | Wave
 
 @dataclass(frozen=True)
 class Step:
-    """One segment's motions; without any it is a hold. `keep_fast`: keep its samples at 1 kHz too."""
+    """One segment's motions; without any it is a hold. `keep_fast`: keep its samples at 1 kHz too.
+
+    `heater`: the board is heated meanwhile, by the twin itself, on a bench by whoever stands there.
+    """
 
     segment: str
     motions: tuple[Motion, ...]
     duration_s: float
     keep_fast: bool = False
+    heater: bool = False
 
 
 @dataclass(frozen=True)
@@ -164,6 +168,8 @@ class Plan:
     ranges: Mapping[str, Ranges]
     states: tuple[State, ...]
     gyro_model: GyroModel = field(compare=False)
+    experiment: Mapping[str, Any] | None = None
+    """What an experiment's plan was made from (`excitation.plan_of`); None for the six states."""
 
     @cached_property
     def duration_s(self) -> float:
@@ -184,10 +190,15 @@ class Plan:
             "states": [state.name for state in self.states],
             "gyro_model": self.gyro_model.to_json(),
             "duration_s": round(self.duration_s, 3),
+            **({"experiment": dict(self.experiment)} if self.experiment else {}),
         }
 
     @classmethod
     def from_json(cls, given: Mapping[str, Any]) -> "Plan":
+        if "experiment" in given:
+            from calib_core import excitation  # which is made of this module's steps
+
+            return excitation.plan_from_json(given)
         return make_plan(
             given["profile"],
             seed=given["seed"],

@@ -13,6 +13,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core.effects.base import Acts
+from calib_core.excitation import HEAT_DEGC, HEAT_S
 from calib_core.gyro_models import PRESETS, GyroModel
 from calib_core.model import Model, Noise, Truth
 from calib_core.twin_daq import Daq, DaqSpec
@@ -83,6 +85,7 @@ class Plant:
         self.tilt, self.covariates = tilt, covariates
         self.now_s = 0.0
         self._polls = 0
+        self._heater = (0.0, 0.0, 0.0)  # since when, how warm then (°C above the room), to where
         self.mount(models or board_truth(seed))
 
     def mount(self, models: Mapping[str, Model]) -> None:
@@ -90,6 +93,22 @@ class Plant:
         self.models = dict(sorted(models.items()))
         rate_hz = self.daq.spec.rate_hz
         self._output = {a: model.simulator(a, rate_hz, self._noise.spawn(1)[0]) for a, model in self.models.items()}
+        self._encoder = {
+            a: model.encoder(a, 1.0 / POLL_S, self._noise.spawn(1)[0])
+            for a, model in self.models.items()
+            if any(effect.acts is Acts.ANGLE for effect in model.effects)
+        }
+        self._feels = any(effect.needs for model in self.models.values() for effect in model.effects)
+
+    def heat(self, on: bool) -> None:
+        """Blow warm air at the board, or leave it to the room, from now on."""
+        goal = HEAT_DEGC if on else 0.0
+        if goal != self._heater[2]:
+            self._heater = (self.now_s, float(self._warmth(np.array([self.now_s]))[0]), goal)
+
+    def _warmth(self, true_s: F64) -> F64:
+        since, warm, goal = self._heater
+        return np.asarray(goal + (warm - goal) * np.exp(-np.maximum(true_s - since, 0.0) / HEAT_S))
 
     @property
     def host_time_s(self) -> float:
@@ -105,19 +124,18 @@ class Plant:
         angles = {axis: angle for axis, (angle, _) in moved.items()}
         if self.tilt and rates["z"].any():
             rates["z"] = rates["z"] * np.cos(np.radians(angles["x"]))
-        temperature, supply = self._surroundings(true) if self.covariates else (None, None)
+        temperature, supply = self._surroundings(true) if self.covariates or self._feels else (None, None)
         columns = [output(Truth(at[axis], rates, angles, temperature, supply)) for axis, output in self._output.items()]
-        if temperature is not None and supply is not None:
-            columns += [0.01 * temperature, 0.5 * supply]
+        if self.covariates and temperature is not None and supply is not None:
+            noise = self._noise.standard_normal((2, n))
+            columns += [0.01 * (temperature + 0.1 * noise[0]), 0.5 * (supply + 0.001 * noise[1])]
         volts = self.daq.convert(np.column_stack(columns))
         self.now_s = float(true[-1])
         return Samples(own, volts, self.host_time_s + self.daq.latency_s())
 
     def _surroundings(self, true_s: F64) -> tuple[F64, F64]:
         """Temperature (°C) and supply (V) around the board: a bench that warms by a degree in half an hour."""
-        noise = self._noise.standard_normal((2, len(true_s)))
-        temperature = 26.0 - np.exp(-true_s / 1800.0) + 0.1 * noise[0]
-        return temperature, 3.0 + 0.001 * noise[1]
+        return 26.0 - np.exp(-true_s / 1800.0) + self._warmth(true_s), np.full(len(true_s), 3.0)
 
     def encoders(self) -> dict[str, tuple[F64, F64]]:
         """What the bus thread has read since the last call: per axis host times (m,) and angles (m,)."""
@@ -130,6 +148,9 @@ class Plant:
             middle = asked + (i + 0.5) * ASK_S
             latched = middle + LATCH_S + LATCH_JITTER_S * self._poll.standard_normal(n)
             # The jitter is far below the 10 ms between polls, so these times increase.
-            read[axis] = HOST_EPOCH_S + middle, to_deg(to_code(servo.motion(latched)[0]))
+            angle, rate = servo.motion(latched)
+            if axis in self._encoder:
+                angle = angle + self._encoder[axis](Truth(latched, {axis: rate}, {axis: angle}))
+            read[axis] = HOST_EPOCH_S + middle, to_deg(to_code(angle))
             servo.forget(self._polls * POLL_S)
         return read

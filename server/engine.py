@@ -208,6 +208,7 @@ def _run(
                 )  # fmt: skip
                 if abort.is_set():
                     raise Aborted
+                rig.heat(step.heater)
                 rig.start(step.motions)
                 for seconds in _blocks(step.duration_s, pace.block_s):
                     if abort.is_set():

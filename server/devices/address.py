@@ -5,7 +5,8 @@ from urllib.parse import parse_qsl
 
 from calib_core.gyro_models import GyroModel
 from calib_core.problem import Problem
-from calib_core.twin import Plant, board_truth
+from calib_core.twin import LATCH_S, Plant, board_truth
+from calib_core.twin_effects import parse, with_effects
 from server.devices.dynamixel_table import DynamixelTable
 from server.devices.ni_daq import NiDaq
 from server.devices.rig import Rig
@@ -77,15 +78,19 @@ def _emulated(url: str, rest: str) -> Rig:
 
 
 def _twin(url: str, rest: str) -> Rig:
-    given = {name: _number(name, text) for name, text in _query(url, rest, ("seed", "covariates")).items()}
+    options = _query(url, rest, ("seed", "covariates", "effects"))
+    effects = parse(options.pop("effects", ""))
+    given = {name: _number(name, text) for name, text in options.items()}
     seed = given.get("seed", 1)
-    table = TwinTable(Plant(seed, covariates=bool(given.get("covariates", 0))))
+    plant = Plant(seed, with_effects(board_truth(seed), effects), covariates=bool(given.get("covariates", 0)))
+    table = TwinTable(plant)
 
     def mount(board: str, gyro_model: GyroModel) -> None:
         with table.lock:
-            table.plant.mount(board_truth(seed, board, gyro_model))
+            plant.mount(with_effects(board_truth(seed, board, gyro_model), effects))
 
-    return Rig(url, table, TwinDaq(table), simulated=True, mount=mount)
+    one_way_s = plant.daq.spec.transfer_s + LATCH_S
+    return Rig(url, table, TwinDaq(table), simulated=True, mount=mount, heat=table.heat, one_way_s=one_way_s)
 
 
 def _query(url: str, rest: str, known: Iterable[str]) -> dict[str, str]:

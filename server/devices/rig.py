@@ -94,11 +94,14 @@ class Rig:
         simulated: bool = False,
         mount: Callable[[str, GyroModel], None] | None = None,
         ended: Callable[[], None] | None = None,
+        heat: Callable[[bool], None] | None = None,
+        one_way_s: float = 0.0,
     ) -> None:
+        """`one_way_s`: how much earlier than they were the clocks alone make the encoders' readings seem, if known."""
         self.url, self.table, self.daq, self.simulated = url, table, daq, simulated
         self.connected = False
         self._faults: dict[str, DeviceError] = {}
-        self._mount, self._ended = mount, ended
+        self._mount, self._ended, self._heat, self._one_way_s = mount, ended, heat, one_way_s
         self._begun, self._starting = False, Lock()
         self._forget()
 
@@ -179,6 +182,11 @@ class Rig:
         if self._mount is not None:
             self._mount(board, gyro_model)
 
+    def heat(self, on: bool) -> None:
+        """Heat the board, or leave it to cool. On a rig without a heater that is for whoever stands there."""
+        if self._heat is not None:
+            self._heat(on)
+
     def begin(self) -> None:
         """Start sampling at time zero, and see that every part answers before anything moves."""
         if self._faults or not self.connected:
@@ -236,7 +244,7 @@ class Rig:
             fast[name] = np.round(scale * samples.volts[:, i], 6)
         for axis, shaft in self._shafts.items():
             read = readings[axis]
-            shaft.take(self.clock.to_daq(read.time_s), read.angle_deg)
+            shaft.take(self.clock.to_daq(read.time_s) + self._one_way_s, read.angle_deg)
             angle, at = shaft.rows(float(time_s[0]) - ROW_S / 2, n)
             columns[f"{axis}_position_deg"], columns[f"{axis}_position_time_s"] = angle, at
             self._watch(axis, shaft, columns.get(f"{axis}_gyro_v"))
@@ -272,6 +280,7 @@ class Rig:
             self._begun = False
         for shaft in self._shafts.values():
             shaft.motion = None
+        self.heat(False)
         for device in (self.table, self.daq):
             try:
                 device.safe()

@@ -43,6 +43,11 @@ class TwinTable:
             read = {axis: Readings(*arrays) for axis, arrays in self.plant.encoders().items()}
         return read | {axis: Readings(np.empty(0), np.empty(0)) for axis in self.silent}
 
+    def heat(self, on: bool) -> None:
+        """The board's heater; the simulated bench has one."""
+        with self.lock:
+            self.plant.heat(on)
+
     def telemetry(self) -> dict[str, Telemetry]:
         return {
             axis: Telemetry(servo.spec.supply_V, 34.0, 0.0, servo.torque_on)
