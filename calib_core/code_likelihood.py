@@ -51,20 +51,53 @@ def sharpen(code_deg: F64, step_deg: float, smooth_deg: F64, variance: F64, site
     return Sites((level / spread - mean * rest) / gained, 1.0 / gained, softness)
 
 
-def path_variance(site_variance: F64, linked: NDArray[np.bool_], link_variance: F64) -> F64:
-    """(m,) variance of a random walk seen through the sites; ``linked`` (m,) is False where it starts anew.
+def path_variance(
+    site_variance: F64, linked: NDArray[np.bool_], dt_s: F64, step_variance: F64, drift_variance: float, decay: F64
+) -> F64:
+    """(m,) variance of a path seen through the sites.
 
-    Diagonal of the inverse of a tridiagonal matrix, from its factors taken from both ends.
+    From reading to reading (``dt_s`` apart; ``linked`` is False where the path starts anew) it makes a step of
+    ``step_variance`` and drifts at a rate that is AR(1): ``drift_variance`` (deg/s)², correlated by ``decay``. Diagonal
+    of the inverse of a banded precision matrix, from its Schur complements taken from both ends: that of block j is
+    L_jj·L_jjᵀ in the Cholesky factor, whichever end it starts from.
     """
-    from scipy.linalg.lapack import dpttrf
+    m = len(site_variance)
+    link = np.where(linked, 1.0 / step_variance, 0.0)
+    onward = np.append(link[1:], 0.0)
+    if drift_variance <= 0.0:
+        from scipy.linalg.lapack import dpttrf
 
-    link = np.where(linked[1:], 1.0 / link_variance[1:], 0.0)
-    diagonal = 1.0 / site_variance
-    diagonal[:-1] += link
-    diagonal[1:] += link
-    forward, _, _ = dpttrf(diagonal, -link)
-    backward, _, _ = dpttrf(diagonal[::-1].copy(), -link[::-1].copy())
-    return np.asarray(1.0 / (forward + backward[::-1] - diagonal))
+        diagonal = 1.0 / site_variance + link + onward
+        forward, _, _ = dpttrf(diagonal, -link[1:])
+        backward, _, _ = dpttrf(diagonal[::-1].copy(), -link[:0:-1].copy())
+        return np.asarray(1.0 / (forward + backward[::-1] - diagonal))
+
+    fresh = 1.0 / (drift_variance * np.where(linked, 1.0 - decay**2, 1.0))
+    kept = np.where(linked, decay, 0.0)
+    later, band = np.append(kept[1:] ** 2 * fresh[1:], 0.0), np.zeros((3, 2 * m))
+    drift, place = slice(0, None, 2), slice(1, None, 2)
+    band[0, drift] = link * dt_s**2 + fresh + later
+    band[0, place] = 1.0 / site_variance + link + onward
+    band[1, drift] = link * dt_s
+    band[1, place] = -onward * np.append(dt_s[1:], 0.0)
+    band[2, 0:-2:2] = -kept[1:] * fresh[1:]
+    band[2, 1:-2:2] = -onward[:-1]
+    backwards = np.zeros_like(band)
+    for offset in range(3):
+        backwards[offset, : 2 * m - offset] = band[offset, : 2 * m - offset][::-1]
+    ahead, behind = _blocks(band), _blocks(backwards)[::, ::-1]
+    own = np.array([band[0, drift], band[1, drift], band[0, place]])
+    a, b, c = ahead + behind[::-1] - own
+    return np.asarray(a / (a * c - b * b))
+
+
+def _blocks(band: F64) -> F64:
+    """(3, m): first, mixed and second entry of each 2 by 2 Schur complement, in the order of ``band``."""
+    from scipy.linalg import cholesky_banded
+
+    factor = cholesky_banded(band, lower=True, check_finite=False)
+    first, mixed, second = factor[0, 0::2], factor[1, 0::2], factor[0, 1::2]
+    return np.array([first**2, first * mixed, mixed**2 + second**2])
 
 
 def _mass(low: F64, high: F64, variance: F64) -> F64:

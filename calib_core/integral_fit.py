@@ -222,9 +222,10 @@ class Design:
         pull = rows.to_readings(whitener.precision_times(whitener.whiten(y - columns @ values)))
         smooth = sites.level_deg - values[1] * sites.variance * pull
         ending, _ = rows.ends
-        density = noise.white**2 * self.averages.samples.interval_s + 2.0 * noise.ar1**2 * noise.correlation_time_s
-        step_variance = density * rows.dt_s[ending] / values[1] ** 2
-        variance = path_variance(sites.variance, ending >= 0, step_variance)
+        dt = rows.dt_s[ending]
+        white, drift = noise.white**2 * self.averages.samples.interval_s / values[1] ** 2, (noise.ar1 / values[1]) ** 2
+        decay = np.exp(-np.diff(readings.time_s, prepend=0.0) / noise.correlation_time_s)
+        variance = path_variance(sites.variance, ending >= 0, dt, white * dt, drift, decay)
         return sharpen(readings.angle_deg, readings.step_deg, smooth, variance, sites)
 
     def estimate(self, y: F64, columns: F64, noise: RowNoise, values: F64) -> tuple[F64, F64]:

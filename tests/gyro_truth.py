@@ -58,6 +58,7 @@ class Bench:
     coloured_V: float = 0.0
     tau_s: float = 0.5
     reading_noise_deg: float = 0.0
+    step_deg: float = STEP_DEG
     header: dict[str, str] = field(default_factory=lambda: {"gyro_average_s": "0.01"})
 
     def angle(self, time_s: F64) -> F64:
@@ -79,8 +80,10 @@ class Bench:
         v = (np.round(v / ADC_V) * ADC_V).reshape(-1, 10).mean(axis=1)
         time = fine.reshape(-1, 10).mean(axis=1)
         read = time + rng.uniform(-0.004, 0.004, len(time))
-        angle = self.angle(read) + rng.uniform(0.0, STEP_DEG) + self.reading_noise_deg * rng.standard_normal(len(read))
-        codes = np.round(np.round(angle / STEP_DEG) * STEP_DEG, 4)
+        angle = (
+            self.angle(read) + rng.uniform(0.0, self.step_deg) + self.reading_noise_deg * rng.standard_normal(len(read))
+        )
+        codes = np.round(np.round(angle / self.step_deg) * self.step_deg, 4)
         columns = {"x_gyro_v": np.round(v, 6), "x_position_deg": codes, "x_position_time_s": np.round(read, 6)}
         return Board(recording(np.round(time, 6), columns, self.header), scale_factor, bias)
 

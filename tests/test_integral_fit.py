@@ -248,3 +248,18 @@ def test_a_bias_that_wanders_is_pointed_out() -> None:
     v = 0.7 + 0.1 * rng.standard_normal(len(time)) + 0.004 * np.cumsum(rng.standard_normal(len(time)))
     f = fit(recording(time, {"x_gyro_dps": v}, {"reference": "stationary"}), "x")
     assert [w["code"] for w in f.warnings] == ["fit.wandering_bias"]
+
+
+@pytest.mark.parametrize("step_deg", [0.003, 0.0003])
+def test_a_fine_encoder_tells_the_delay_although_the_gyro_is_noisy(step_deg: float) -> None:
+    bench = Bench(seconds=40.0, step_deg=step_deg)
+    for seed in range(3):
+        f = fit(bench.board(seed).recording, "x")
+        assert f.delay_s == pytest.approx(0.003, abs=max(4.0 * f.delay_uncertainty_s, 2e-5))
+        assert f.delay_uncertainty_s < 2e-4
+
+
+def test_slow_noise_keeps_its_correlation_time_when_codes_are_read_as_intervals() -> None:
+    fits = [fit(Bench(coloured_V=0.0008, tau_s=0.5).board(200 + seed).recording, "x") for seed in range(8)]
+    assert np.mean([f.noise["correlation_time_s"] for f in fits]) == pytest.approx(0.5, rel=0.2)
+    assert np.mean([f.noise["ar1"] for f in fits]) == pytest.approx(0.0008, rel=0.1)
