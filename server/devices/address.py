@@ -62,7 +62,9 @@ def _bench(url: str, rest: str) -> Rig:
     table = table_of(url)
     if not joined:
         raise Problem("rig.no_daq", given=url, bench=BENCH)
-    return Rig(url, table, NiDaq.from_url(daq))
+    converter = NiDaq.from_url(daq)
+    converter.load()
+    return Rig(url, table, converter)
 
 
 def _emulated(url: str, rest: str) -> Rig:

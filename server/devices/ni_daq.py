@@ -83,6 +83,13 @@ class NiDaq:
             raise Problem("daq.delay", given=delay)
         return cls(found[3], inputs, found[1] or "", 1e-6 * float(delay))
 
+    def load(self) -> None:
+        """Import NI's library: a second during which this process' other threads keep no time, so before they run."""
+        import nidaqmx.stream_readers
+
+        if self.server:
+            import nidaqmx._grpc_interpreter  # noqa: F401
+
     # --- the protocol ------------------------------------------------------------------------------------------
     def open(self) -> None:
         """Make the task and read a few samples: a device that is known may yet be unplugged. Raises `DeviceError`."""
