@@ -126,7 +126,7 @@ def test_a_rest_is_one_reading_and_slow_motion_is_no_rest() -> None:
     stop = np.where(time < 3.0, 20.0 * time, np.where(time < 6.0, 60.0, 60.0 + 20.0 * (time - 6.0)))
     readings = encoder_noise.inspect(time, np.round(stop / STEP_DEG) * STEP_DEG)
     resting = readings.rest >= 0
-    assert resting[320:580].all()
+    assert resting[330:580].all()
     assert not resting[:300].any()
     assert not resting[605:].any()
     assert len(set(readings.rest[resting].tolist())) == 1
