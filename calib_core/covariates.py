@@ -33,7 +33,7 @@ def of(recording: Recording, axis: str, design: Design, bias: float, scale_facto
         slow = CROSSOVER_S / interval
         rate = felt - _smooth(felt, slow) + np.gradient(_smooth(angle, slow), interval)
         rate = np.convolve(np.pad(rate, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
-        position = np.cumsum(felt) * interval
+        position = np.concatenate([[0.0], np.cumsum(felt[1:] + felt[:-1])]) * interval / 2.0
         position += _smooth(angle - position, slow)
         still = design.averages.at[design.averages.at >= 0]
         rate[still] = 0.0
@@ -77,6 +77,15 @@ def of(recording: Recording, axis: str, design: Design, bias: float, scale_facto
         specific_force_g=force or None,
         reference=reference_values,
     )
+
+
+def encoder_rate(recording: Recording, axis: str, design: Design, smooth_s: float) -> F64:
+    """(k,) the reference's rate at the gyro's samples, an encoder's smoothed over ``smooth_s``, without the gyro."""
+    s = design.averages.samples
+    reference = recording.reference_rate(axis)
+    if reference is not None:
+        return np.nan_to_num(reference[s.index])
+    return np.gradient(_smooth(_angle(recording, axis, s.time_s), smooth_s / s.interval_s), s.interval_s)
 
 
 def direction(rate_dps: F64) -> F64:

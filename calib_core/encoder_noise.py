@@ -16,8 +16,8 @@ Mask = NDArray[np.bool_]
 
 REST_S = 0.4
 """The same code for at least this long is a rest."""
-SETTLING_S = 0.1
-"""Cut from both ends of a rest: the table may still creep within the code."""
+SETTLING_S, LEAVING_S = 0.25, 0.1
+"""Cut from the beginning and the end of a rest: the table still creeps within the code, for several time constants."""
 FINE = 30.0
 """A grid so fine that neighbouring readings are this many codes apart is a printed number's last digit, or as good."""
 PATTERN = 16
@@ -83,9 +83,9 @@ def inspect(time_s: F64, angle_deg: F64) -> Readings:
     resting = (time_s[last] - time_s[first] >= REST_S) & ~_passing(codes[first], length)
     rest = np.where(resting[number], np.cumsum(resting)[number] - 1, -1)
     settling = (time_s - time_s[first][number] < SETTLING_S) & (number > 0)
-    settling |= (time_s[last][number] - time_s < SETTLING_S) & (number < len(first) - 1)
+    settling |= (time_s[last][number] - time_s < LEAVING_S) & (number < len(first) - 1)
     rest[settling] = -1
-    settled = int(np.searchsorted(time_s, time_s[0] + SETTLING_S))
+    settled = int(np.searchsorted(time_s, time_s[0] + LEAVING_S))
     run = np.where(resting[number] & (rest < 0), settled, length[number])
     return Readings(time_s, angle_deg, step, run, _recurrence(codes, number), rest)
 

@@ -14,4 +14,5 @@ def library() -> dict[str, type[Effect]]:
     """Every effect by its public name, in alphabetical order."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
-    return {effect.name: effect for effect in sorted(Effect.__subclasses__(), key=lambda effect: effect.name)}
+    own = [effect for effect in Effect.__subclasses__() if effect.__module__.startswith(f"{__name__}.")]
+    return {effect.name: effect for effect in sorted(own, key=lambda effect: effect.name)}

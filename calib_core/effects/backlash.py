@@ -1,5 +1,7 @@
 """The gears have play: the encoder moves before, or after, the plate."""
 
+import numpy as np
+
 from calib_core.effects.base import F64, Acts, Covariates, Effect, Param, Stage
 
 
@@ -17,6 +19,8 @@ class Backlash(Effect):
     name, stage, acts, needs = "backlash", Stage.TABLE, Acts.ANGLE, ()
     b = Param("deg", 0.5, (-10.0, 10.0))
 
+    start = Param("1", 0.0, (-1.0, 1.0), grid=(-1.0, 0.0, 1.0))  # the sign before the first rotation
+
     @classmethod
-    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
-        return {"b": c.direction / 2.0}
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
+        return {"b": np.where(c.direction == 0.0, nonlinear["start"], c.direction) / 2.0}

@@ -41,6 +41,8 @@ class Param:
     bounds: tuple[float, float]
     grid: tuple[float, ...] = ()
     log: bool = False
+    discrete: bool = False
+    """Whether only the values of the grid have a meaning (how many terms of a series)."""
 
 
 @dataclass

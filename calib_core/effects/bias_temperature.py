@@ -19,6 +19,8 @@ class BiasTemperature(Effect):
     k2 = Param("{out}/degC^2", 5e-6, (-1e-3, 1e-3))
     k3 = Param("{out}/degC^3", 1e-7, (-1e-4, 1e-4))
 
+    degree = Param("1", 1.0, (1.0, 3.0), grid=(1.0, 2.0, 3.0), discrete=True)
+
     @classmethod
-    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
-        return {"k1": c.warmth, "k2": c.warmth**2, "k3": c.warmth**3}
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
+        return {f"k{power}": c.warmth**power for power in range(1, round(nonlinear["degree"]) + 1)}

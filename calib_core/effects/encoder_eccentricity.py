@@ -20,7 +20,14 @@ class EncoderEccentricity(Effect):
     a = Param("deg", 0.5, (-10.0, 10.0))
     b = Param("deg", 0.5, (-10.0, 10.0))
 
+    a2 = Param("deg", 0.1, (-10.0, 10.0))
+    b2 = Param("deg", 0.1, (-10.0, 10.0))
+    harmonics = Param("1", 1.0, (1.0, 2.0), grid=(1.0, 2.0), discrete=True)
+
     @classmethod
-    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
         angle = np.radians(c.position_deg)
-        return {"a": np.sin(angle), "b": np.cos(angle) - 1.0}
+        shapes = {"a": np.sin(angle), "b": np.cos(angle) - 1.0}
+        if nonlinear["harmonics"] > 1.5:
+            shapes |= {"a2": np.sin(2.0 * angle), "b2": np.cos(2.0 * angle) - 1.0}
+        return shapes

@@ -18,6 +18,8 @@ class EncoderNonlinearity(Effect):
     k2 = Param("1/deg", 2e-5, (-1e-2, 1e-2))
     k3 = Param("1/deg^2", 2e-7, (-1e-4, 1e-4))
 
+    degree = Param("1", 3.0, (2.0, 3.0), grid=(2.0, 3.0), discrete=True)
+
     @classmethod
-    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
-        return {"k2": c.position_deg**2, "k3": c.position_deg**3}
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
+        return {f"k{power}": c.position_deg**power for power in range(2, round(nonlinear["degree"]) + 1)}

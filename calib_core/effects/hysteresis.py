@@ -1,5 +1,7 @@
 """The zero depends on which way the gyro turned last."""
 
+import numpy as np
+
 from calib_core.effects.base import F64, Acts, Covariates, Effect, Param, Stage
 
 
@@ -17,6 +19,8 @@ class Hysteresis(Effect):
     name, stage, acts, needs = "hysteresis", Stage.SENSOR, Acts.OUTPUT, ()
     h = Param("{out}", 6e-4, (-0.1, 0.1))
 
+    start = Param("1", 0.0, (-1.0, 1.0), grid=(-1.0, 0.0, 1.0))  # the sign before the first rotation
+
     @classmethod
-    def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
-        return {"h": c.direction}
+    def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
+        return {"h": np.where(c.direction == 0.0, nonlinear["start"], c.direction)}

@@ -1,0 +1,203 @@
+"""What is the model missing? From a recording to verdict, names, evidence, and the error that is left (METHOD 3).
+
+The order: deterministic checks; saturation; the search of the library; structure in no library; rivals; error on data
+not seen. Everything is told by codes and values; sentences are made where a language is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core import covariates, gap_saturation
+from calib_core.effects import Effect, library
+from calib_core.gap_checks import Check, checks
+from calib_core.gap_error import Explanation
+from calib_core.gap_search import SHARE, Search, Suspicion
+from calib_core.gap_space import Space, Term
+from calib_core.gap_unknown import CERTAIN, Structure, structures
+from calib_core.integral_fit import Design
+from calib_core.noise_fit import first_guess
+from calib_core.problem import Problem
+from calib_core.recording import Recording
+
+F64 = NDArray[np.float64]
+
+BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
+"""Effects that are no shape in the residual: each has a test of its own, or can have none."""
+
+
+@dataclass
+class Diagnosis:
+    """The answer, in objects; ``to_json`` gives CONTRACT 3."""
+
+    recording: Recording
+    axis: str
+    checks: list[Check]
+    verdict: str = "not_testable"
+    search: Search | None = None
+    asked: list[Term] = field(default_factory=list)
+    rivals: list[list[Suspicion]] = field(default_factory=list)
+    candidates: list[dict[str, Any]] = field(default_factory=list)
+    clip: gap_saturation.Clip | None = None
+    clip_gain: float = 0.0
+    hum: Any = None
+    unknown: Structure | None = None
+    before: Explanation | None = None
+    after: Explanation | None = None
+
+
+def diagnose(
+    recording: Recording,
+    axis: str,
+    *,
+    effects: Sequence[str] = (),
+    suspects: dict[str, type[Effect]] | None = None,
+    seed: int = 0,
+) -> Diagnosis:
+    """Compares ``axis`` of the recording with base + ``effects`` and names what is missing.
+
+    ``suspects`` replaces the library (a user's own effects, or one left out on purpose). Raises Problem for a recording
+    without the axis or without a reference.
+    """
+    answer = Diagnosis(recording, axis, checks(recording, axis))
+    if any(check.blocking and not check.ok for check in answer.checks):
+        return answer
+    pool = dict(library() if suspects is None else suspects)
+    rng = np.random.default_rng(seed)
+    space, search = _search(recording, axis, pool, effects, rng)
+    if "saturation" in pool:
+        space, search = _clipped(answer, recording, space, search, pool, effects, rng)
+    search.run()
+    search.merge()
+    search.confirm()
+    _structure(answer, search)
+    answer.search = search
+    answer.asked = search.chosen[: len(effects)]
+    answer.rivals = search.rivals()[search.given :]
+    answer.before, answer.after = Explanation(search.space, answer.asked), Explanation(search.space, named(search))
+    answer.candidates = _candidates(search, pool, answer)
+    found = bool(named(search)[len(effects) :]) or answer.hum is not None or answer.clip is not None
+    tied = any(len(r) > 1 for r in answer.rivals)
+    if answer.unknown is not None:
+        answer.verdict = "unknown"
+    else:
+        answer.verdict = ("ambiguous" if tied else "missing") if found else "adequate"
+    return answer
+
+
+def named(search: Search) -> list[Term]:
+    """The chosen terms that have a name."""
+    return [t for t in search.chosen if t.name != "unknown"]
+
+
+def _search(
+    recording: Recording,
+    axis: str,
+    pool: dict[str, type[Effect]],
+    effects: Sequence[str],
+    rng: np.random.Generator,
+    mask: NDArray[np.bool_] | None = None,
+) -> tuple[Space, Search]:
+    """The space of the recording, and a search of it that has the asked effects in its model."""
+    design = Design.of(recording, axis, mask)
+    rough = design.rough()
+    scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")
+    c = covariates.of(recording, axis, design, float(rough[0]), scale_factor)
+    space = Space(design, c, rough)
+    # The base is now known well: the covariates, and the space about them, once more.
+    if len(space.values) > 1:
+        space = Space(design, covariates.of(recording, axis, design, *space.values.tolist()), space.values)
+    shaped = {n: e for n, e in pool.items() if n not in BY_ITSELF and not e.missing(c)}
+    search = Search(space, shaped, rng)
+    if effects:
+        first = [next((t for t in search.terms() if t.name == name), None) or _refuse(name) for name in effects]
+        search = Search(space, shaped, rng, chosen=first)
+        search.settle()
+    return space, search
+
+
+def _refuse(name: str) -> Term:
+    raise Problem("diagnosis.effect_not_possible", effect=name)
+
+
+def _clipped(
+    answer: Diagnosis,
+    recording: Recording,
+    space: Space,
+    search: Search,
+    pool: dict[str, type[Effect]],
+    effects: Sequence[str],
+    rng: np.random.Generator,
+) -> tuple[Space, Search]:
+    """The space without the samples on a limit, where that explains the record better than any other effect."""
+    clip = gap_saturation.find(recording, answer.axis, space.design, first_guess(space.design.rows, space.residual))
+    if clip is None:
+        return space, search
+    kept, without = _search(recording, answer.axis, pool, effects, rng, ~clip.clipped)
+    space.use_noise(kept.noise)
+    everything = search.chi2(search.chosen)
+    _, ranking = search.scan()
+    other = min((search.refined(s.term, search.chosen)[1] for s in ranking[:3]), default=everything)
+    inside = len(space.design.rows) - len(kept.design.rows)
+    clipped = without.chi2(without.chosen) + inside
+    if clipped > other:
+        return space, search
+    answer.clip, answer.clip_gain = clip, everything - clipped
+    return kept, without
+
+
+def _structure(answer: Diagnosis, search: Search) -> None:
+    """Flags what no library effect explains; names that do not pass beside it are dropped."""
+    found = structures(search.space, search.chosen)
+    explained = search.chi2([]) - search.chi2(search.chosen)
+    if not found or found[0].z < CERTAIN or found[0].gain < SHARE * explained:
+        return
+    answer.unknown = found[0]
+    names = {t.name for t in search.chosen[search.given :]}
+    asked = search.chosen[: search.given]
+    beside = Search(search.space, {n: e for n, e in search.suspects.items() if n in names}, search.rng)
+    beside.chosen = [*asked, found[0].term]
+    beside.given = len(beside.chosen)
+    beside.run()
+    search.chosen = [*asked, *beside.chosen[beside.given :]]
+    search.findings = beside.findings
+
+
+def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis) -> list[dict[str, Any]]:
+    """Every effect of the library: tested, not excited by this motion, or without data."""
+    c, chosen = search.space.covariates, {t.name for t in search.chosen}
+    tested = {s.term.name: s for s in search.last}
+    tested |= {f.chosen.term.name: f.chosen for f in search.findings}
+    rows = []
+    for name, effect in pool.items():
+        row: dict[str, Any] = {
+            "effect": name,
+            "status": "tested",
+            "two_delta_lnL": None,
+            "p": None,
+            "held_out_gain": None,
+        }
+        if name == "input_loading" or (name not in BY_ITSELF and effect.missing(c)):
+            row["status"] = "no_data"
+        elif name == "saturation":
+            row["two_delta_lnL"] = answer.clip_gain if answer.clip else 0.0
+        elif name == "mains_hum":
+            row["two_delta_lnL"] = answer.hum.two_delta_lnL if answer.hum else 0.0
+        elif name in tested:
+            row["two_delta_lnL"], row["p"] = tested[name].gain, p_value(tested[name].z)
+        elif name not in BY_ITSELF and name not in chosen:
+            row["status"] = "not_excited"
+        rows.append(row)
+    return rows
+
+
+def p_value(z: float) -> float:
+    """Two-sided, of an equivalent |z|."""
+    from scipy.special import ndtr
+
+    return float(2.0 * ndtr(-abs(z)))

@@ -1,0 +1,143 @@
+"""A diagnosis as CONTRACT 3's JSON: numbers, codes and values; the sentences are added where a language is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from calib_core.gap import Diagnosis, p_value
+from calib_core.gap_error import Explanation
+from calib_core.integral_fit import SUFFIX
+
+FAILING = 4.0
+"""|z| from which a stretch is said to fail."""
+
+
+def to_json(d: Diagnosis) -> dict[str, Any]:
+    """CONTRACT 3, without the rendered sentences."""
+    recording, axis = d.recording, d.axis
+    gyro = recording.gyro(axis) if axis in recording.axes else None
+    out: dict[str, Any] = {
+        "recording": {
+            "file": None,
+            "board": recording.header.get("board"),
+            "samples": int(np.isfinite(gyro.values).sum()) if gyro else 0,
+            "duration_s": recording.duration_s,
+        },
+        "axis": axis,
+        "unit": gyro.unit if gyro else None,
+        "verdict": d.verdict,
+        "checks": [{"name": c.name, "ok": c.ok, "code": c.code, "values": dict(c.values)} for c in d.checks],
+        "model": {"effects": [t.name for t in d.asked], "parameters": []},
+        "noise": None,
+        "error": None,
+        "where_it_fails": [],
+        "missing": [],
+        "rivals": [],
+        "rival_sets": [],
+        "candidates": d.candidates,
+        "unknown": None,
+        "next_experiment": None,
+        "after": None,
+    }
+    if d.search is None or d.before is None or d.after is None:
+        failed = next((c for c in d.checks if c.blocking and not c.ok), None)
+        code, values = (failed.code, dict(failed.values)) if failed else ("diagnosis.not_testable", {})
+        return out | {"code": code, "values": values}
+    space = d.search.space
+    noise, scale = space.noise.noise, abs(space.scale_factor) or 1.0
+    error, after = d.before.error(), d.after.error()
+    missing = _missing(d)
+    out |= {
+        "noise": {
+            "white_dps": noise.white / scale,
+            "ar1_dps": noise.ar1 / scale,
+            "correlation_time_s": noise.correlation_time_s if noise.ar1 > 0.0 else None,
+        },
+        "error": {
+            "held_out_rms_dps": error.held_out_rms_dps,
+            "floor_rms_dps": error.floor_rms_dps,
+            "holdout": {"block_s": error.block_s, "blocks": error.blocks},
+        },
+        "where_it_fails": [
+            {"covariate": f.covariate, "from": f.low, "to": f.high, "residual_dps": f.residual_dps, "z": f.z}
+            for f in d.before.failures()
+            if abs(f.z) >= FAILING
+        ],
+        "missing": missing,
+        "rivals": [[s.term.name for s in r] for r in d.rivals if len(r) > 1],
+        "after": {
+            "effects": [*(t.name for t in d.asked), *(m["effect"] for m in missing)],
+            "held_out_rms_dps": after.held_out_rms_dps,
+            "parameters": parameters(d.after),
+        },
+    }
+    out["model"]["parameters"] = parameters(d.before)
+    if d.unknown is not None:
+        out["unknown"] = {"covariate": d.unknown.covariate, "p": p_value(d.unknown.z)}
+    values = {
+        "effects": [m["effect"] for m in missing],
+        "before_dps": error.held_out_rms_dps,
+        "after_dps": after.held_out_rms_dps,
+        "floor_dps": after.floor_rms_dps,
+        "covariate": d.unknown.covariate if d.unknown else None,
+    }
+    return out | {"code": f"diagnosis.{d.verdict}", "values": values}
+
+
+def _missing(d: Diagnosis) -> list[dict[str, Any]]:
+    """One best effect per finding, in order of entry."""
+    assert d.search is not None
+    assert d.after is not None
+    found: list[dict[str, Any]] = []
+    if d.clip is not None:
+        limits = {"V_lo": d.clip.low, "V_hi": d.clip.high}
+        unit = d.recording.gyro(d.axis).unit
+        parameters_ = [_parameter(f"saturation.{n}", v, unit, None) for n, v in limits.items() if v is not None]
+        found.append(_finding("saturation", d.clip_gain, float(np.sqrt(max(d.clip_gain, 0.0))), parameters_))
+    if d.hum is not None:
+        found.append(d.hum.to_finding(d.recording.gyro(d.axis).unit))
+    every = {p["name"]: p for p in parameters(d.after)}
+    for finding in d.search.findings:
+        name = finding.chosen.term.name
+        own = [p for n, p in every.items() if n.startswith(f"{name}.")]
+        found.append(_finding(name, finding.chosen.gain, finding.chosen.z, own))
+    return found
+
+
+def _finding(name: str, gain: float, z: float, parameters_: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"effect": name, "two_delta_lnL": gain, "p": p_value(z), "parameters": parameters_}
+
+
+def parameters(explanation: Explanation) -> list[dict[str, Any]]:
+    """Bias, scale factor and every parameter of the terms, with standard uncertainties, in the recording's unit."""
+    space = explanation.space
+    unit = space.design.averages.samples.unit
+    suffix = SUFFIX[unit]
+    values, covariance = explanation.solution()
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    rows = [_parameter(f"bias_{suffix}", float(space.values[0] + values[0]), unit, float(spread[0]))]
+    if len(space.values) > 1:
+        name = f"scale_factor_{suffix}_per_dps"
+        per = "1" if unit == "deg/s" else f"{unit}/(deg/s)"
+        rows.append(_parameter(name, float(space.values[1] + values[1]), per, float(spread[1])))
+    at = space.base.shape[1]
+    for term in explanation.terms:
+        known = term.effect.parameters()
+        if not term.fixed:
+            for k, name in enumerate(term.names):
+                size = (float(values[at + k]), float(spread[at + k]))
+                rows.append(_parameter(f"{term.name}.{name}", size[0], _unit(known[name].unit, unit), size[1]))
+        for name, value in zip(term.effect.nonlinear(), term.setting, strict=False):
+            rows.append(_parameter(f"{term.name}.{name}", value, _unit(known[name].unit, unit), None))
+        at += term.columns.shape[1]
+    return rows
+
+
+def _unit(template: str, unit: str) -> str:
+    return template.replace("{out}", unit)
+
+
+def _parameter(name: str, value: float, unit: str, uncertainty: float | None) -> dict[str, Any]:
+    return {"name": name, "value": value, "unit": unit, "standard_uncertainty": uncertainty}

@@ -1,0 +1,71 @@
+"""Saturation: stretches where the output stays on one level while the table turns faster than that level means.
+
+Inside the clip the output says nothing about the rate, so those samples leave the record; what remains is judged as
+any other record is. The evidence is what that explains, over the whole record, against the best other effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core.covariates import encoder_rate
+from calib_core.integral_fit import Design
+from calib_core.recording import Recording
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LEVEL = 4.0
+"""Samples within this many deviations of the extreme level are on it."""
+LEAST = 15
+"""So many samples make a level."""
+SMOOTH_S, STEADY_DPS2, STEADY_S = 0.06, 150.0, 0.1
+"""Where the rate changes faster, or the output moves within this time, the smoothed encoder is behind."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Which samples of the recording (n,) are on a limit, and the limits (None where not reached)."""
+
+    clipped: Mask
+    low: float | None
+    high: float | None
+
+
+def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip | None:
+    """The limits that the output of ``axis`` seems to stop at, or None; ``noise`` is one sample's deviation."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    s = design.averages.samples
+    rate = encoder_rate(recording, axis, design, SMOOTH_S)
+    middle, reach = float(np.median(s.output)), float(np.ptp(s.output)) / 2.0
+    width = max(3, round(STEADY_S / s.interval_s))
+    wander = maximum_filter1d(s.output, width) - minimum_filter1d(s.output, width)
+    steady = (np.abs(np.gradient(rate, s.interval_s)) < STEADY_DPS2) & (wander < 3.0 * LEVEL * noise)
+    inner = steady & (np.abs(s.output - middle) < 0.7 * reach)
+    if reach < 20.0 * noise or inner.sum() < 100:
+        return None
+    fit = np.polynomial.Polynomial.fit(rate[inner], s.output[inner], 1)
+    expected = fit(rate)
+    spread = float(np.std(s.output[inner] - expected[inner]))
+    limits: dict[float, float] = {}
+    clipped = np.zeros(len(s.output), bool)
+    for side in (-1.0, 1.0):
+        top = side * s.output
+        extreme = float(np.quantile(top, 1.0 - 5.0 / len(top)))
+        on = steady & (top > extreme - 2.0 * LEVEL * noise)
+        beyond = side * (expected - s.output)[on]
+        independent = max(on.sum() * s.interval_s / SMOOTH_S, 1.0)
+        if on.sum() >= LEAST and beyond.mean() > max(LEVEL * noise / 2.0, 5.0 * spread / np.sqrt(independent)):
+            level = float(np.median(s.output[on]))
+            limits[side] = level
+            clipped |= side * (s.output - level) > -LEVEL * noise
+    if not limits:
+        return None
+    near = np.convolve(clipped, np.ones(5), mode="same") > 0.0
+    whole = np.zeros(len(recording), bool)
+    whole[s.index[near]] = True
+    return Clip(whole, limits.get(-1.0), limits.get(1.0))

@@ -1,0 +1,317 @@
+"""Which effects a record asks for, how sure that is, and which others would serve as well (METHOD 3, steps 4 to 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core.effects.base import Effect
+from calib_core.gap_space import Gram, Space, Term
+
+F64 = NDArray[np.float64]
+
+FALSE_ALARM = 0.01
+"""Of a healthy record given anything at all; designing at 2 % fails a 2 % bar as often as not."""
+DRAWS = 4000
+SHARE = 0.004
+"""A new term must buy this share of what is explained already: the form of a big effect is never quite right."""
+RIVAL = 6.0
+"""2ΔlnL within which two explanations cannot be told apart."""
+MOST = 3
+STEP_EVERY_S = 4.0
+CLEAN = 1e-3
+"""Of a column's square, what must be its own to stand beside others while the noise is estimated."""
+NOISE_COMPANY = 8
+"""So many best classes stand in the model while the noise is estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Suspicion:
+    """A term with its evidence over base and the terms before it."""
+
+    term: Term
+    gain: float
+    z: float
+    """The gain as that of one degree of freedom: its square root where the term has one column."""
+    sure: float = float("nan")
+    """The same of what the encoder's codes could not feign."""
+
+
+@dataclass
+class Finding:
+    """What was added in one step, and every class that could have been, refined, best first."""
+
+    chosen: Suspicion
+    field: list[Suspicion]
+    threshold: float
+
+
+@dataclass
+class Search:
+    """The state of one diagnosis."""
+
+    space: Space
+    suspects: dict[str, type[Effect]]
+    rng: np.random.Generator
+    chosen: list[Term] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    last: list[Suspicion] = field(default_factory=list)
+    threshold: float = float("nan")
+    _columns: dict[str, list[Term]] = field(default_factory=dict)
+    given: int = field(init=False)
+    """So many of the chosen were there from the start."""
+
+    def __post_init__(self) -> None:
+        self.given = len(self.chosen)
+
+    def terms(self) -> list[Term]:
+        """Every suspect not yet chosen, at every point of its grid."""
+        taken = {t.name for t in self.chosen}
+        for name, effect in self.suspects.items():
+            if name not in self._columns:
+                self._columns[name] = [self.space.term(effect, s) for s in settings(effect, self.space)]
+        return [t for name, terms in self._columns.items() if name not in taken for t in terms]
+
+    def scan(self) -> tuple[Gram, list[Suspicion]]:
+        """The best setting of every class over base and chosen, best class first; and the Gram matrix behind it."""
+        terms = self.terms()
+        gram = self.space.gram([*self.chosen, *terms])
+        kept, places = _places(self.chosen, gram.base), _places([*self.chosen, *terms], gram.base)
+        projected = gram.without([k for place in kept for k in place])
+        best: dict[str, Suspicion] = {}
+        for term, place in zip(terms, places[len(kept) :], strict=True):
+            gain, sure = gram.gain(projected, place, term)
+            if not np.isfinite(gain) or (term.effect.positive and projected[place[0], 0] < 0.0):
+                continue
+            z, least = (float(equivalent_z(g, len(place))) for g in (gain, sure))
+            found = Suspicion(term, gain, z, least)
+            if term.name not in best or found.z > best[term.name].z:
+                best[term.name] = found
+        self._projected, self._places = projected, places[len(kept) :]
+        return gram, sorted(best.values(), key=lambda s: -s.z)
+
+    def null_tail(self, terms: Sequence[Term]) -> float:
+        """The (1 - FALSE_ALARM) quantile of the best z over all ``terms`` in a record where nothing is missing."""
+        own = np.diag(self._projected)
+        usable = [(t, p) for t, p in zip(terms, self._places, strict=True) if own[p].min() > 1e-7]
+        order = [k for _, place in usable for k in place]
+        block = self._projected[np.ix_(order, order)]
+        size = np.sqrt(np.diag(block))
+        power, vectors = np.linalg.eigh(block / np.outer(size, size))
+        draws = (vectors * np.sqrt(np.maximum(power, 0.0))) @ self.rng.standard_normal((len(order), DRAWS))
+        best, start = np.zeros(DRAWS), 0
+        for _, place in usable:
+            part = draws[start : start + len(place)]
+            if len(place) == 1:
+                z = np.abs(part[0])
+            else:
+                own_block = block[start : start + len(place), start : start + len(place)]
+                own_size = size[start : start + len(place)]
+                inverse = np.linalg.pinv(own_block / np.outer(own_size, own_size), rcond=1e-9, hermitian=True)
+                z = equivalent_z(np.einsum("ij,ik,kj->j", part, inverse, part), len(place))
+            best = np.maximum(best, z)
+            start += len(place)
+        return float(np.quantile(best, 1.0 - FALSE_ALARM))
+
+    def chi2(self, terms: Sequence[Term]) -> float:
+        """χ² of the record under base and ``terms``, by a whitening of their own."""
+        gram = self.space.gram(terms)
+        places = _places(terms, gram.base)
+        free = [k for t, p in zip(terms, places, strict=True) if not t.fixed for k in p]
+        if any(t.fixed for t in terms):
+            # The terms whose coefficient is one go to the left-hand side.
+            whole = gram.white[:, [0]] - sum(gram.white[:, p] for t, p in zip(terms, places, strict=True) if t.fixed)
+            gram = Gram(np.column_stack([whole, gram.white[:, 1:]]), gram.base)
+        projected = gram.without(free)
+        return float(projected[0, 0] * gram.scale[0] ** 2)
+
+    def refined(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
+        """``term`` at the best setting of its nonlinear parameters beside ``others``, and the χ² there."""
+        if term.effect.curvature is not None:
+            return self._refined_late(term, others)
+        from scipy.optimize import minimize_scalar
+
+        best, low = term, self.chi2([*others, term])
+        for k, name in enumerate(term.effect.nonlinear()):
+            p = term.effect.parameters()[name]
+            if p.discrete:
+                best, low = self._best_of(best, k, p.grid, others)
+                continue
+            grid = sorted({s[k] for s in settings(term.effect, self.space)})
+            at = int(np.argmin(np.abs(np.array(grid) - best.setting[k])))
+            ends = (grid[at - 2] if at > 1 else p.bounds[0], grid[at + 2] if at + 2 < len(grid) else p.bounds[1])
+
+            def moved(u: float, here: Term = best, k: int = k, log: bool = p.log) -> Term:
+                setting = (*here.setting[:k], float(np.exp(u)) if log else float(u), *here.setting[k + 1 :])
+                return self.space.term(here.effect, setting)
+
+            def cost(u: float, moved: Callable[[float], Term] = moved) -> float:
+                return self.chi2([*others, moved(u)])
+
+            bounds = tuple(np.log(ends)) if p.log else ends
+            answer = minimize_scalar(cost, bounds=bounds, method="bounded", options={"maxiter": 14})
+            if answer.fun < low:
+                best, low = moved(float(answer.x)), float(answer.fun)
+        return best, low
+
+    def _best_of(self, term: Term, k: int, grid: Sequence[float], others: Sequence[Term]) -> tuple[Term, float]:
+        """``term`` with the value of its parameter ``k`` that makes it most certain, and the χ² there."""
+        now = self.chi2(others)
+        tried = [self.space.term(term.effect, (*term.setting[:k], v, *term.setting[k + 1 :])) for v in grid]
+        chi2 = [self.chi2([*others, t]) for t in tried]
+        z = [float(equivalent_z(now - x, len(t.names))) for t, x in zip(tried, chi2, strict=True)]
+        best = max(range(len(z)), key=z.__getitem__)
+        return tried[best], chi2[best]
+
+    def _refined_late(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
+        for _ in range(3):
+            tau = self.value(term, others)
+            if term.name == "angular_acceleration":
+                tau = -tau
+            term = self.space.term(term.effect, [tau])
+        return term, self.chi2([*others, term])
+
+    def value(self, term: Term, others: Sequence[Term]) -> float:
+        """The coefficient of ``term``'s one column beside ``others``."""
+        gram = self.space.gram([*others, term])
+        last = gram.matrix.shape[0] - 1
+        return float(gram.coefficients(list(range(1 + gram.base, last + 1)))[0][-1])
+
+    def run(self, most: int = MOST) -> None:
+        """Adds effects one by one while the best passes the threshold and buys its share; fills ``findings``."""
+        while True:
+            gram, ranking = self.scan()
+            self.space.refit_noise([*self.chosen, *self._company(gram, ranking)])
+            _, ranking = self.scan()
+            # Half of the noise's uncertainty is that of every z.
+            self.threshold = self.null_tail(self.terms()) * (1.0 + 0.5 * self.space.doubt)
+            self.last = ranking
+            sure = {s.term.name for s in ranking if s.sure >= self.threshold}
+            if not sure or len(self.chosen) - self.given >= most:
+                return
+            now = self.chi2(self.chosen)
+            rivals: list[Suspicion] = []
+            for s in ranking:
+                if s.z < 0.5 * ranking[0].z or len(rivals) >= 8:
+                    break
+                term, chi2 = self.refined(s.term, self.chosen)
+                if not (term.effect.positive and self.value(term, self.chosen) < 0.0):
+                    rivals.append(Suspicion(term, now - chi2, float(equivalent_z(now - chi2, len(term.names)))))
+            rivals.sort(key=lambda s: -s.gain)
+            while rivals and rivals[0].term.name not in sure:
+                del rivals[0]
+            if not rivals or rivals[0].gain < SHARE * (self.chi2([]) - now):
+                return
+            simplest = min((s for s in rivals if rivals[0].gain - s.gain < 1.0), key=lambda s: len(s.term.setting))
+            self.findings.append(Finding(simplest, rivals, self.threshold))
+            self.chosen.append(simplest.term)
+            self.settle()
+
+    def rivals(self) -> list[list[Suspicion]]:
+        """For each chosen effect, every effect that would serve in its place, the others kept: itself first or near."""
+        answer = []
+        for k, term in enumerate(self.chosen):
+            others = [*self.chosen[:k], *self.chosen[k + 1 :]]
+            now = self.chi2(others)
+            trial = Search(self.space, self.suspects, self.rng, chosen=others, _columns=self._columns)
+            _, ranking = trial.scan()
+            field = [Suspicion(term, now - self.chi2([*others, term]), 0.0)]
+            for s in ranking[:8]:
+                if s.term.name != term.name and s.z > 0.5 * ranking[0].z:
+                    other, chi2 = self.refined(s.term, others)
+                    if not (other.effect.positive and self.value(other, others) < 0.0):
+                        field.append(Suspicion(other, now - chi2, 0.0))
+            best = max(s.gain for s in field)
+            answer.append([s for s in sorted(field, key=lambda s: -s.gain) if best - s.gain < RIVAL])
+        return answer
+
+    def confirm(self) -> None:
+        """Drops what no longer passes once the noise is that of the chosen model alone.
+
+        While the search goes on the noise is estimated beside the best of all classes, which makes it small.
+        """
+        while len(self.chosen) > self.given:
+            self.space.refit_noise(self.chosen)
+            both = self.chi2(self.chosen)
+            weakest, least = self.given, np.inf
+            for k in range(self.given, len(self.chosen)):
+                gain = self.chi2([*self.chosen[:k], *self.chosen[k + 1 :]]) - both
+                z = float(equivalent_z(gain, len(self.chosen[k].names)))
+                if z < least:
+                    weakest, least = k, z
+            if least >= self.findings[weakest - self.given].threshold:
+                return
+            del self.chosen[weakest], self.findings[weakest - self.given]
+
+    def merge(self) -> None:
+        """Two effects that one other explains as well were that one: the truth may not look best at first."""
+        while len(self.chosen) - self.given >= 2:
+            for i, j in combinations(range(self.given, len(self.chosen)), 2):
+                others = [t for k, t in enumerate(self.chosen) if k not in (i, j)]
+                trial = Search(self.space, self.suspects, self.rng, chosen=others, _columns=self._columns)
+                _, ranking = trial.scan()
+                both = self.chi2(self.chosen)
+                for s in ranking[:4]:
+                    term, chi2 = self.refined(s.term, others)
+                    if chi2 < both + RIVAL and term.name not in {self.chosen[i].name, self.chosen[j].name}:
+                        self.chosen = [*others, term]
+                        self.findings = [*self.findings[: len(others)], Finding(s, [s], self.threshold)]
+                        break
+                else:
+                    continue
+                break
+            else:
+                return
+
+    def _company(self, gram: Gram, ranking: Sequence[Suspicion]) -> list[Term]:
+        """The best classes whose columns are not nearly spanned by those before them: REML wants a clean basis."""
+        place = dict(zip(map(id, self.terms()), self._places, strict=True))
+        kept = [k for p in _places(self.chosen, gram.base) for k in p]
+        company: list[Term] = []
+        for s in ranking:
+            columns = place[id(s.term)]
+            if np.diag(gram.without(kept))[columns].min() > CLEAN:
+                kept += columns
+                company.append(s.term)
+            if len(company) == NOISE_COMPANY:
+                break
+        return company
+
+    def settle(self) -> None:
+        """Refines the nonlinear parameters of all chosen terms beside each other."""
+        if len(self.chosen) > 1:
+            for k, term in enumerate(self.chosen):
+                if term.effect.nonlinear() or term.effect.curvature is not None:
+                    self.chosen[k], _ = self.refined(term, [*self.chosen[:k], *self.chosen[k + 1 :]])
+
+
+def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:
+    """The grid of the effect's nonlinear parameters; times of a step lie all along the record."""
+    if effect.name == "bias_step":
+        end = float(space.covariates.time_s[-1])
+        step = max(STEP_EVERY_S, end / 100.0)
+        return [(float(t),) for t in np.arange(step, end - step / 2.0, step)]
+    return list(product(*(effect.parameters()[name].grid for name in effect.nonlinear())))
+
+
+def equivalent_z(gain: float | F64, freedom: int) -> float | F64:
+    """The |z| of one normal variable that is as improbable as ``gain`` with ``freedom`` degrees of freedom."""
+    if freedom == 1:
+        return np.sqrt(np.maximum(gain, 0.0))
+    from scipy.special import chdtrc, ndtri
+
+    tail = np.maximum(chdtrc(freedom, np.minimum(np.maximum(gain, 0.0), 600.0)), 1e-290)
+    return np.where(np.asarray(gain) < 600.0, -ndtri(tail / 2.0), np.sqrt(np.maximum(gain - 2.0 * freedom, 0.0)))[()]
+
+
+def _places(terms: Iterable[Term], base: int) -> list[list[int]]:
+    """The indices of each term's columns in the Gram matrix."""
+    places, at = [], 1 + base
+    for term in terms:
+        places.append(list(range(at, at + term.columns.shape[1])))
+        at += term.columns.shape[1]
+    return places

@@ -1,0 +1,115 @@
+"""What the diagnosis says of records whose truth it did not make."""
+
+import json
+
+import numpy as np
+import pytest
+from shared import shared
+
+from calib_core import recording
+from calib_core.gap import Diagnosis, diagnose, named
+from calib_core.gap_report import to_json
+from calib_core.recording import Recording
+from server.bench import gap_records
+
+
+def made(seed: int, effects: dict[str, float], **options: object) -> Recording:
+    """A record of the independent generator as a Recording."""
+    record = gap_records.record(seed, effects, **options)  # type: ignore[arg-type]
+    columns = dict(record.columns)
+    time_s = columns.pop("time_s")
+    names = tuple(dict.fromkeys(record.segments))
+    codes = np.array([names.index(name) for name in record.segments], np.int32)
+    return Recording(time_s=time_s, columns=columns, segment_codes=codes, segment_names=names, header={})
+
+
+def told(diagnosis: Diagnosis) -> set[str]:
+    """Every name given, and everything declared to be as good."""
+    assert diagnosis.search is not None
+    names = {t.name for t in named(diagnosis.search)} | {s.term.name for rivals in diagnosis.rivals for s in rivals}
+    return names | ({"saturation"} if diagnosis.clip else set())
+
+
+@pytest.mark.parametrize("plan", ["first", "second"])
+def test_a_healthy_record_is_given_nothing(plan: str) -> None:
+    diagnosis = diagnose(made(7, {}, plan=plan), "x")
+    assert diagnosis.verdict == "adequate"
+    assert to_json(diagnosis)["missing"] == []
+
+
+@pytest.mark.parametrize(
+    ("effect", "plan"),
+    [
+        ("scale_factor_cubic", "first"),
+        ("hysteresis", "second"),
+        ("bias_temperature", "second"),
+        ("encoder_eccentricity", "first"),
+        ("backlash", "second"),
+        ("dead_band", "first"),
+        ("saturation", "first"),
+        ("cross_axis", "second"),
+    ],
+)
+def test_a_hidden_effect_is_named_and_the_error_falls_to_the_floor(effect: str, plan: str) -> None:
+    truth = gap_records.record(11, {effect: 0.6}, plan=plan)
+    diagnosis = diagnose(made(11, {effect: 0.6}, plan=plan), "x")
+    answer = to_json(diagnosis)
+    assert effect in told(diagnosis)
+    assert diagnosis.verdict in ("missing", "ambiguous")
+    assert diagnosis.after is not None
+    windows, first = diagnosis.after.windows, diagnosis.after.first
+    if effect != "saturation":  # there, samples on the limit are not the record's any more
+        noise = windows.mean(truth.gyro_noise_dps[:, None]) - windows.rate(truth.encoder_error_deg[:, None])
+        floor = float(np.sqrt(np.mean(noise[first] ** 2)))
+        assert answer["after"]["held_out_rms_dps"] < 1.03 * floor
+    assert answer["after"]["held_out_rms_dps"] < 0.9 * answer["error"]["held_out_rms_dps"] or effect == "saturation"
+
+
+def test_lag_and_delay_of_four_milliseconds_are_declared_a_tie() -> None:
+    diagnosis = diagnose(made(3, {"bandwidth_lag": 0.5}), "x")
+    assert {"bandwidth_lag", "time_offset"} <= told(diagnosis)
+    assert diagnosis.verdict == "ambiguous"
+
+
+def test_an_effect_in_no_library_is_flagged_and_gets_no_name() -> None:
+    answer = to_json(diagnose(made(5, {"cogging_7_per_rev": 2.0}), "x"))
+    assert answer["verdict"] == "unknown"
+    assert answer["unknown"]["covariate"] == "x_position_deg"
+    assert answer["missing"] == []
+
+
+def test_two_effects_are_both_found() -> None:
+    diagnosis = diagnose(made(9, {"bias_temperature": 1.0, "scale_factor_asymmetry": 1.0}), "x")
+    assert {"bias_temperature", "scale_factor_asymmetry"} <= told(diagnosis)
+
+
+def test_parameters_are_recovered_within_their_uncertainty() -> None:
+    record = gap_records.record(21, {"scale_factor_cubic": 1.0})
+    answer = to_json(diagnose(made(21, {"scale_factor_cubic": 1.0}), "x"))
+    found = {p["name"]: p for p in answer["after"]["parameters"]}
+    for name, truth in (
+        ("bias_V", record.truth["bias_V"]),
+        ("scale_factor_V_per_dps", record.truth["scale_factor_V_per_dps"]),
+    ):
+        assert abs(found[name]["value"] - truth) < 5.0 * found[name]["standard_uncertainty"]
+    cubic = found["scale_factor_cubic.k"]
+    assert abs(abs(cubic["value"]) - 1.2e-6) < 5.0 * cubic["standard_uncertainty"]
+
+
+def test_asked_effects_stand_in_the_model_and_are_not_missing() -> None:
+    answer = to_json(diagnose(made(11, {"scale_factor_cubic": 0.6}), "x", effects=["scale_factor_cubic"]))
+    assert answer["model"]["effects"] == ["scale_factor_cubic"]
+    assert answer["verdict"] == "adequate"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["bias_temperature", "scale_factor_cubic", "g_sensitivity", "bandwidth_lag", "hysteresis", "saturation", "two"],
+)
+def test_the_shared_records_are_named(name: str) -> None:
+    path = shared(f"hidden_effects/{name}.csv.gz")
+    truths = [json.loads(line) for line in shared("hidden_effects/truth.jsonl").read_text().splitlines()]
+    truth = next(t for t in truths if t["id"] == name)
+    with path.open("rb") as file:
+        diagnosis = diagnose(recording.read(file, name=path.name), truth["axis"])
+    assert set(truth["effects"]) <= told(diagnosis)
