@@ -19,6 +19,7 @@ from calib_core.gap_checks import Check, checks
 from calib_core.gap_error import Explanation
 from calib_core.gap_search import SHARE, Search, Suspicion
 from calib_core.gap_space import Space, Term
+from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_unknown import CERTAIN, Structure, structures
 from calib_core.integral_fit import Design
 from calib_core.noise_fit import first_guess
@@ -45,7 +46,7 @@ class Diagnosis:
     candidates: list[dict[str, Any]] = field(default_factory=list)
     clip: gap_saturation.Clip | None = None
     clip_gain: float = 0.0
-    hum: Any = None
+    hum: Hum | None = None
     unknown: Structure | None = None
     before: Explanation | None = None
     after: Explanation | None = None
@@ -76,6 +77,9 @@ def diagnose(
     search.merge()
     search.confirm()
     _structure(answer, search)
+    if "mains_hum" in pool:
+        line = find_hum(search.space.design.averages.samples, moving=search.space.design.moves)
+        answer.hum = line if line is not None and line.found else None
     answer.search = search
     answer.asked = search.chosen[: len(effects)]
     answer.rivals = search.rivals()[search.given :]

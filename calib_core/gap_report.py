@@ -97,7 +97,11 @@ def _missing(d: Diagnosis) -> list[dict[str, Any]]:
         parameters_ = [_parameter(f"saturation.{n}", v, unit, None) for n, v in limits.items() if v is not None]
         found.append(_finding("saturation", d.clip_gain, float(np.sqrt(max(d.clip_gain, 0.0))), parameters_))
     if d.hum is not None:
-        found.append(d.hum.to_finding(d.recording.gyro(d.axis).unit))
+        unit, hum = d.recording.gyro(d.axis).unit, d.hum
+        size = _parameter("mains_hum.amplitude", hum.amplitude, unit, hum.amplitude_uncertainty)
+        pitch = _parameter("mains_hum.f", hum.frequency_hz, "Hz", hum.frequency_uncertainty_hz)
+        line = {"effect": "mains_hum", "two_delta_lnL": hum.two_delta_lnL, "p": hum.p, "parameters": [size, pitch]}
+        found.append(line)
     every = {p["name"]: p for p in parameters(d.after)}
     for finding in d.search.findings:
         name = finding.chosen.term.name
