@@ -51,3 +51,8 @@ def test_a_simulated_board_is_found_again_by_both_estimates() -> None:
         for scale_pct, bias_mV in found.values():
             assert abs(scale_pct) < 0.1
             assert abs(bias_mV) < 0.1
+
+
+def test_the_soak_belongs_to_the_bus(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "core", "--soak"]) == 2
+    assert "bench bus --soak" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from calib_core.problem import Problem
 
 SUBJECTS: dict[str, tuple[str, ...]] = {
     "core": ("core", "boards", "parsing", "calibration", "startup"),
+    "bus": ("bus_daq",),
     "coverage": ("coverage",),
 }
 

@@ -5,6 +5,7 @@ import json
 import os
 import sys
 
+from calib_core.problem import Problem
 from server.bench import SUBJECTS, Row, run, table
 
 EXAMPLE = "gyrobench bench core --json"
@@ -13,16 +14,19 @@ EXAMPLE = "gyrobench bench core --json"
 def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", metavar="NAME", help=f"{', '.join(SUBJECTS)} (default: all of them)")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions and seeds")
+    parser.add_argument("--soak", action="store_true", help="bus: ten minutes of the emulated bench instead")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of tables")
 
 
 def main(args: argparse.Namespace) -> int:
     # Small products on shared cores: a second BLAS thread costs more than it brings (METHOD 3). Before numpy comes in.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if args.soak and args.name != "bus":
+        raise Problem("bench.soak")
     measured: dict[str, list[Row]] = {}
     for name in [args.name] if args.name else SUBJECTS:
         measured[name] = rows = []
-        for row in run(name, quick=args.quick):
+        for row in _soak() if args.soak else run(name, quick=args.quick):
             rows.append(row)
             if sys.stderr.isatty():
                 print(f"\r\033[K{name}: {row.name}", end="", file=sys.stderr, flush=True)
@@ -33,3 +37,9 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({name: [row.to_json() for row in rows] for name, rows in measured.items()}))
     return 0
+
+
+def _soak() -> list[Row]:
+    from server.bench.bus_daq import soak
+
+    return soak()
