@@ -102,6 +102,8 @@ def _identity(content: Mapping[str, Any], lang: str) -> Iterator[tuple[str, obje
     yield "issued", _time(content["issued_at"])
     yield "temperature", None if temperature is None else f"{temperature:g} °C"
     yield "rig", rig["url"]
+    if "skew_ppm" in rig.get("clock", {}):
+        yield "clocks", render("certificate.clocks", rig["clock"], lang)
     yield "profile", render(f"profile.{content['profile']}", {}, lang)
     yield "readings", content["readings"]
     yield "recording", recording["id"]
