@@ -169,17 +169,13 @@ class Whitener:
         """(n,) or (n, p) in, the same shape out."""
         if self._order is None:
             return self._shrink(self._lower(self._filter(columns)))
-        out = np.empty_like(columns)
-        out[self._order] = self._lower(columns[self._order])
-        return out
+        return self._back(self._lower(np.take(columns.T, self._order, axis=-1).T))
 
     def precision_times(self, white: F64) -> F64:
         """Σ⁻¹·x (n,) for a column that ``whiten`` turned into ``white``."""
         if self._order is not None:
-            out = np.empty_like(white)
-            out[self._order] = self._lower(white[self._order], transposed=True)
-            return out
-        out = self._lower(self._shrink(white), transposed=True)
+            return self._back(self._lower(white[self._order], transposed=True))
+        out = self._lower(self._shrink(white.copy()), transposed=True)
         out[:-1] -= self._phi[1:] * out[1:]
         return out
 
@@ -191,16 +187,24 @@ class Whitener:
         return out
 
     def _lower(self, columns: F64, rows: slice = slice(None), *, transposed: bool = False) -> F64:
+        """Solves in place where ``columns`` is in Fortran's order."""
         from scipy.linalg.lapack import dtbtrs
 
-        solved, _ = dtbtrs(self._factor[:, rows], columns, uplo="L", trans="T" if transposed else "N")
+        trans = "T" if transposed else "N"
+        solved, _ = dtbtrs(self._factor[:, rows], columns, uplo="L", trans=trans, overwrite_b=True)
         return np.asarray(solved, dtype=float).reshape(columns.shape)
 
+    def _back(self, columns: F64) -> F64:
+        """Rows in the order of time again."""
+        place = np.empty_like(self._order)
+        place[self._order] = np.arange(len(place))
+        return np.asarray(np.take(columns.T, place, axis=-1).T)
+
     def _shrink(self, columns: F64) -> F64:
+        """Takes the rests' errors into account, in place."""
         if not self._far:
             return columns
-        out = columns.copy()
         overlap = np.array([u @ columns[a] for a, u in self._far])
         for (a, u), weight in zip(self._far, self._weight @ overlap, strict=True):
-            out[a] -= np.multiply.outer(u, weight)
-        return out
+            columns[a] -= np.multiply.outer(u, weight)
+        return columns
