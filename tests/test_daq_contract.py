@@ -8,9 +8,11 @@ import pytest
 from ni_bench import bench
 
 from calib_core.twin import Plant
+from server.devices import DeviceError
 from server.devices.clock import ClockRelation
 from server.devices.ni_daq import NiDaq
 from server.devices.protocols import Daq
+from server.devices.rig import Rig
 from server.devices.twin_rig import TwinDaq, TwinTable
 from server.emulators.plant import PlantClient
 from server.emulators.process import Child
@@ -81,3 +83,15 @@ def test_two_clocks_are_related_on_emulated_hardware_as_they_truly_are() -> None
             # The clocks differ by thousands of seconds. A sample is in hand after 1.5 ms at least, never before.
             assert -30.0 < error_ms[-1] < -1.0
             assert relation.offset_s > 0.0
+
+
+def test_a_daq_that_is_gone_before_the_next_motion_is_told_as_a_part_of_the_rig() -> None:
+    table = TwinTable(Plant(1))
+    with bench() as ni, closing(ni.daq()) as made:
+        rig = Rig("twin:", table, made)
+        rig.open()
+        rig.daq.start()
+        ni.device.unplug()
+        with pytest.raises(DeviceError, match=r"daq\.unplugged"):
+            list(rig.waiting())
+        assert {part["part"]: part["code"] for part in rig.status()}["daq"] == "daq.unplugged"

@@ -217,7 +217,8 @@ class Rig:
 
     def waiting(self) -> Iterator[Block]:
         """Rows that came while nobody read: to be had before the next motion starts, or its segment would be late."""
-        rows = self.daq.waiting() // MEAN_OF
+        with self._asking("daq"):
+            rows = self.daq.waiting() // MEAN_OF
         if rows * ROW_S >= LATE_S:
             yield self.read(rows * ROW_S)
 
