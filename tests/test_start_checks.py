@@ -105,6 +105,12 @@ def test_the_fourfold_output_is_found_with_the_single_one_chosen_and_the_other_w
     assert checked(rig(GYRO_FAULTS["gyro_other_model"]), FOUR)["gyro x"].ok
 
 
+def test_a_gyro_of_one_axis_is_checked_on_that_axis() -> None:
+    found = checked(rig(), replace(OUT, axes={"x": OUT.axes["x"]}))
+    assert list(found) == ["servo x", "servo z", "daq", "range", "gyro x", "step x"]
+    assert all(check.ok for check in found.values())
+
+
 def test_set_points_past_the_sensor_or_the_rig_are_found_before_the_table_moves() -> None:
     plan = make_plan(seed=1, gyro_model=OUT, ranges={"x": {"rate_dps": 130.0}})
     found = checked(rig(), plan=plan)

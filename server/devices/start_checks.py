@@ -52,7 +52,8 @@ def run(rig: Rig, gyro_model: GyroModel, *, plan: Plan | None = None, abort: Abo
     try:
         rig.begin()
         yield from answering(rig, stopped)
-        yield reach(rig, gyro_model, plan or sequence.make_plan(seed=1, gyro_model=gyro_model))
+        states = [state for state in sequence.STATES if state[-1] in gyro_model.axes]
+        yield reach(rig, gyro_model, plan or sequence.make_plan(seed=1, states=states, gyro_model=gyro_model))
         alive = True
         for check in gyro_answers(rig, gyro_model, abort=stopped):
             alive = alive and check.ok is True
@@ -100,7 +101,7 @@ def gyro_answers(rig: Rig, gyro_model: GyroModel, *, abort: Abort | None = None)
         rows = bench.swing(turned)
         for sensor in axes:
             felt[sensor, turned], rest[sensor] = _response(rows, sensor, turned)
-    for axis in axes:
+    for axis in _of(rig, gyro_model):
         yield _judge(axis, {turned: felt[axis, turned] for turned in axes}, rest[axis], gyro_model)
 
 
@@ -109,12 +110,11 @@ def _response(rows: Mapping[str, F64], sensor: str, turned: str) -> tuple[float,
 
     Over each stroke from rest to rest the integral of V − V_rest is the scale factor times the angle turned.
     """
-    still = np.concatenate([rows[f"{sensor}_gyro_v"][part] for part in rows["still"].astype(bool).nonzero()])
-    rest_V = float(still.mean())
-    stroke = rows["stroke"].astype(int)
+    still, stroke = rows["still"] > 0, rows["stroke"].astype(int)
+    rest_V = float(rows[f"{sensor}_gyro_v"][still].mean())
     volts, angle = rows[f"{sensor}_gyro_v"] - rest_V, rows[f"{turned}_position_deg"]
     area = np.array([volts[stroke == k].sum() * ROW_S for k in range(1, stroke.max() + 1)])
-    ends = np.array([np.nanmean(angle[(stroke == k) & (rows["still"] > 0)]) for k in range(stroke.max() + 1)])
+    ends = np.array([np.nanmean(angle[(stroke == k) & still]) for k in range(stroke.max() + 1)])
     way = np.diff(ends)
     return float(area @ way / (way @ way)), rest_V
 
@@ -153,7 +153,7 @@ def step(rig: Rig, gyro_model: GyroModel, *, abort: Abort | None = None) -> Iter
     """Thesis 4.1.3 on each axis: a step to the range's end at constant rate. The rig has begun; it ends at 0°."""
     bench = _Bench(rig, abort or threading.Event())
     bench.home()
-    for axis in rig.axes:
+    for axis in _of(rig, gyro_model):
         state = sequence.make_plan(seed=1, states=[f"estimate_{axis}"], gyro_model=gyro_model).states[0]
         out, back = state.steps[-2:]
         rows, load_out = bench.watched(axis, out.motions, out.duration_s)
@@ -190,6 +190,11 @@ def _judge_step(
     if balance > BALANCE_PCT:
         return Check(name, False, "check.step_balance", values, "cure.step_balance")
     return Check(name, True, "check.step", values)
+
+
+def _of(rig: Rig, gyro_model: GyroModel) -> list[str]:
+    """The axes that both the rig turns and the gyro has."""
+    return [axis for axis in rig.axes if axis in gyro_model.axes]
 
 
 @dataclass
