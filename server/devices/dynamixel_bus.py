@@ -37,11 +37,11 @@ SUCCESS, SILENCE = 0, -3001
 
 
 class NoReply(Exception):
-    """No usable reply this time: `silent`, or garbled."""
+    """No usable reply this time. `why`: silent, garbled, or unstamped (good, but too late for its time to be known)."""
 
-    def __init__(self, silent: bool) -> None:
-        super().__init__("silent" if silent else "garbled")
-        self.silent = silent
+    def __init__(self, why: str) -> None:
+        super().__init__(why)
+        self.why = why
 
 
 class Babble(Exception):
@@ -50,10 +50,9 @@ class Babble(Exception):
 
 @dataclass(frozen=True)
 class Reply:
-    """Registers, the servo's alarms, and when by the host's clock: the middle of the transaction."""
+    """Registers, and when by the host's clock: the middle of the transaction."""
 
     data: bytes
-    alarm: Alarm
     time_s: float
 
 
@@ -107,6 +106,7 @@ class Bus:
         self._packets: Any = None
         self._settled: set[int] = set()
         self._probe = 0
+        self._alarms: dict[int, Alarm] = {}
         self.timer_ms = USUAL_LATENCY_MS
         self.return_delay_s = 5e-4
         self.good = 0
@@ -148,25 +148,35 @@ class Bus:
         """
         self._settle(servo)
         began = time.perf_counter()
-        data, alarm = self._ask(servo, address, length)
+        data = self._ask(servo, address, length)
         ended = time.perf_counter()
         needed = (length + FRAME_BYTES) * 10.0 / self.baud + self.return_delay_s + self.timer_ms * 1e-3
         if ended - began > needed + STAMP_S:
             self.lost["unstamped"] += 1
-            raise NoReply(silent=False)
+            raise NoReply("unstamped")
         self.good += 1
-        return Reply(data, alarm, 0.5 * (began + ended))
+        return Reply(data, 0.5 * (began + ended))
 
     def registers(self, servo: int, address: int, length: int, *, tries: int = 20) -> bytes:
         """Registers whose time does not matter, asked for until they come; raises NoReply after the last try."""
         for left in reversed(range(tries)):
             try:
                 self._settle(servo)
-                return self._ask(servo, address, length)[0]
+                return self._ask(servo, address, length)
             except NoReply:
                 if not left:
                     raise
         raise ValueError("no tries")
+
+    def alarms(self, servo: int) -> Alarm:
+        """What this servo complained of since the last call, in whatever reply."""
+        return self._alarms.pop(servo, Alarm(0))
+
+    def ping(self, servo: int) -> bool:
+        """Whether this servo is there at all: a ping is answered even by one that is set to answer nothing else."""
+        with self._line() as handler:
+            _, result, _ = self._packets.txRxPacket(handler, [0xFF, 0xFF, servo, 2, 1, 0])
+        return bool(result == SUCCESS)
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
         """The same registers of several servos at once. Nothing answers: read back what matters."""
@@ -180,7 +190,7 @@ class Bus:
                 raise OSError("the port does not take what is sent")
 
     # --- one question ------------------------------------------------------------------------------------------
-    def _ask(self, servo: int, address: int, length: int) -> tuple[bytes, Alarm]:
+    def _ask(self, servo: int, address: int, length: int) -> bytes:
         packet: list[int] = []
         with self._line() as handler:
             result = self._packets.readTx(handler, servo, address, length)
@@ -189,13 +199,14 @@ class Bus:
                 if result != SUCCESS or packet[2] == servo:
                     break
         if result != SUCCESS:
-            raise self._lose(servo, silent=result == SILENCE)
+            raise self._lose(servo, "silent" if result == SILENCE else "garbled")
         if packet[3] != length + 2 or len(packet) != length + 6:
             raise self._lose(servo)  # another question's answer: ours is still to come
         alarm = Alarm(packet[4])
         if alarm & (Alarm.CHECKSUM | Alarm.INSTRUCTION | Alarm.RANGE):
             raise self._lose(servo)  # the question did not reach it whole
-        return bytes(packet[5:-1]), alarm
+        self._alarms[servo] = self._alarms.get(servo, Alarm(0)) | alarm
+        return bytes(packet[5:-1])
 
     def _settle(self, servo: int) -> None:
         """After a failure, and at first: make sure that no old reply of this servo is still to come."""
@@ -208,15 +219,14 @@ class Bus:
                 pass
             handler.ser.timeout = POLL_S
         self._probe = self._probe % PROBES + 1
-        data, _ = self._ask(servo, Register.ID, self._probe)
-        if data[0] != servo:
+        if self._ask(servo, Register.ID, self._probe)[0] != servo:
             raise self._lose(servo)
         self._settled.add(servo)
 
-    def _lose(self, servo: int, *, silent: bool = False) -> NoReply:
+    def _lose(self, servo: int, why: str = "garbled") -> NoReply:
         self._settled.discard(servo)
-        self.lost["silent" if silent else "garbled"] += 1
-        return NoReply(silent)
+        self.lost[why] += 1
+        return NoReply(why)
 
     @contextmanager
     def _line(self) -> Iterator[Any]:
@@ -229,7 +239,7 @@ class Bus:
         except Babble as error:
             self._settled.clear()
             self.lost["garbled"] += 1
-            raise NoReply(silent=False) from error
+            raise NoReply("garbled") from error
         except (OSError, TerminalError) as error:
             # The SDK would say "busy" from now on: drop everything of this port.
             log.warning("%s is gone: %s", self.port, error)

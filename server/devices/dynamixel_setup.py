@@ -42,7 +42,6 @@ class Setup:
     max_deg: float
     wheel: bool
     highest_degC: int
-    status_return: int
     shutdown: Alarm
     torque_limit: int
     supply_V: float
@@ -62,7 +61,6 @@ class Setup:
             max_deg=to_deg(min(high, CODES)),
             wheel=low == high == 0,
             highest_degC=table[Register.HIGHEST_TEMPERATURE],
-            status_return=table[Register.STATUS_RETURN],
             shutdown=Alarm(table[Register.SHUTDOWN] & 0x7F),
             torque_limit=at(Register.TORQUE_LIMIT),
             supply_V=table[Register.PRESENT_VOLTAGE] / 10.0,
@@ -95,8 +93,6 @@ def faults(setups: Mapping[str, Setup], ids: Mapping[str, int]) -> Iterator[Devi
         who["part"] = found.model.part
         if found.wheel:
             yield DeviceError("rig.servo_wheel", **who)
-        if found.status_return == 0:
-            yield DeviceError("rig.servo_quiet", **who)
         if found.shutdown & GUARD != GUARD:
             yield DeviceError("rig.servo_unguarded", **who)
     parts_found = {axis: model.part for axis, model in models.items() if model is not None}

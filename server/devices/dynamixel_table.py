@@ -47,8 +47,9 @@ WANTED_S = 2.0  # after the last read
 HEARTBEAT_S = 10.0  # nobody has read for this long, and the torque is on: whoever moved the table is gone
 NAP_S = 0.002  # a stop waits at most this long for the thread to look up, plus one transaction
 SILENT_S, MISSES = 0.4, 5  # a servo without a usable reply for this long, and so many times, is gone
-RETRY_S = 0.5  # a port that went away is looked for this often
+RETRY_S = 0.2  # a port that went away is looked for this often
 OPEN_S, SAFE_S = 8.0, 1.0
+LET_GO_S = 0.5  # torque off is said again until it is seen, this long
 KEEP = 3000  # readings kept for a reader who is late: half a minute
 RESENDS = 5
 URGENT = -10
@@ -57,6 +58,7 @@ JUMP_STEPS = 6  # a reading may be this far from where the last and the top spee
 JUMPS = 3  # as many wild readings in a row are the truth
 SUPPLY_JUMP_V, TEMPERATURE_JUMP_DEGC = 2.5, 3.0
 POWER = (Register.TORQUE_ENABLE, 12)  # torque, LED, compliance, goal, speed, torque limit
+LOST = {"silent": "rig.servo_silent", "garbled": "rig.bus_noise", "unstamped": "rig.host_busy"}
 FAULTS = {Alarm.OVERLOAD: "rig.overload", Alarm.OVERHEAT: "rig.overheat", Alarm.VOLTAGE: "rig.supply"}
 
 
@@ -274,6 +276,8 @@ class DynamixelTable:
             try:
                 setups[axis] = Setup.of(self.bus.registers(servo.number, *TABLE))
             except NoReply as no:
+                if self.bus.ping(servo.number):
+                    raise DeviceError("rig.servo_quiet", axis=axis, id=servo.number) from no
                 raise self._silent(axis, no) from no
         for fault in faults(setups, {axis: servo.number for axis, servo in self._servos.items()}):
             raise fault
@@ -288,6 +292,7 @@ class DynamixelTable:
             servo.highest_degC = setups[axis].highest_degC
             servo.seen_s, servo.last, servo.missed, servo.course = now, None, 0, None
             servo.readings.clear()
+            self.bus.alarms(servo.number)  # of what was before
             self._axes[axis] = setups[axis].axis(axis)
         deadline = now + SILENT_S
         for axis in self._servos:
@@ -361,12 +366,12 @@ class DynamixelTable:
         said = state(reply.data)
         if said is None or not self._likely(axis, said, reply.time_s):
             self.bus.lost["garbled"] += 1
-            self._missed(axis, NoReply(silent=False))
+            self._missed(axis, NoReply("garbled"))
             return
         servo.last, servo.seen_s, servo.missed, servo.wild = said, reply.time_s, 0, 0
         with self._changed:
             servo.readings.append((reply.time_s, said.angle_deg))
-        self._watch(axis, reply.alarm, said)
+        self._watch(axis, said)
 
     def _likely(self, axis: str, said: State, time_s: float) -> bool:
         """Eight bits of checksum let one garbled packet in 256 pass; a shaft, its supply and its heat do not jump."""
@@ -389,17 +394,17 @@ class DynamixelTable:
             raise self._silent(axis, no)
 
     def _silent(self, axis: str, no: NoReply) -> DeviceError:
-        code = "rig.servo_silent" if no.silent else "rig.bus_noise"
-        return DeviceError(code, axis=axis, part=self._axes[axis].part, id=self._servos[axis].number)
+        return DeviceError(LOST[no.why], axis=axis, part=self._axes[axis].part, id=self._servos[axis].number)
 
-    def _watch(self, axis: str, alarm: Alarm, said: State) -> None:
+    def _watch(self, axis: str, said: State) -> None:
         """Raises what the servo complains of."""
+        alarm = self.bus.alarms(self._servos[axis].number)
         who = {"axis": axis, "part": self._axes[axis].part, "load_pct": abs(said.load_pct), "supply_V": said.supply_V}
         who |= {"temperature_degC": said.temperature_degC, "highest_degC": self._servos[axis].highest_degC}
+        if not self._servos[axis].powered:
+            alarm &= ~(Alarm.OVERLOAD | Alarm.OVERHEAT)  # they may stay until the torque is on again
         if said.temperature_degC > self._servos[axis].highest_degC:
             alarm |= Alarm.OVERHEAT
-        if not self._servos[axis].powered:
-            alarm &= ~Alarm.OVERLOAD  # it stays until the torque is on again
         for bit, code in FAULTS.items():
             if alarm & bit:
                 raise DeviceError(code, **who)
@@ -431,7 +436,10 @@ class DynamixelTable:
             return
         if power[0] == 1 and power[6:10] == word(course.sent[0]) + word(course.sent[1]):
             course.done = True
-        elif course.resends >= RESENDS:
+            return
+        if servo.last is not None:
+            self._watch(axis, servo.last)  # a servo that shut itself down takes no goal
+        if course.resends >= RESENDS:
             raise DeviceError("rig.command_lost", axis=axis, part=self._axes[axis].part)
         else:
             course.resends, course.due_s = course.resends + 1, -math.inf
@@ -460,7 +468,8 @@ class DynamixelTable:
         for servo in self._servos.values():
             servo.course = None
         try:
-            for _ in range(4):
+            until = clock() + LET_GO_S
+            while clock() < until:
                 self.bus.write(Register.TORQUE_ENABLE, off)
                 for axis, servo in list(waiting.items()):
                     try:

@@ -197,6 +197,8 @@ class Rig:
             self.table.read()  # what was read before is of no recording
         self.daq.start()
         self.read(0.1)
+        while self._now_s < SILENT_S and any(np.isnan(shaft.seen_deg) for shaft in self._shafts.values()):
+            self.read(0.1)
         for axis, shaft in self._shafts.items():
             if np.isnan(shaft.seen_deg):
                 raise self._fault(f"servo {axis}", "rig.servo_silent", axis=axis, part=self.axes[axis].part)

@@ -48,6 +48,11 @@ class Handler:
             angle, rate = self._plant.servos[axis].motion(np.array([self._now()]))
         return float(angle[0]), float(rate[0])
 
+    def angles(self, axis: str, host_time_s: F64) -> F64:
+        """Where a shaft truly was at times (n,) of this machine's clock: what readings have to agree with."""
+        with self._lock:
+            return self._plant.servos[axis].motion(host_time_s - self._began_s)[0]
+
     def command(self, goals: Mapping[str, tuple[float, float]]) -> None:
         """Axes' goals (deg) and speeds (deg/s), now and together."""
         with self._lock:

@@ -79,6 +79,7 @@ class Bus:
             servo.table[Register.RETURN_DELAY] = 0
         self._faults: deque[tuple[str, int | None, float]] = deque()
         self._held = b""
+        self._deaf = 0
         self._counts = dict.fromkeys(("instructions", "replies", "faults"), 0)
         self._written: deque[tuple[float, int, int, bytes]] = deque(maxlen=NOTED)
         self._together: dict[str, tuple[float, float]] | None = None
@@ -98,8 +99,13 @@ class Bus:
         """Faults asked for and not yet met."""
         return len(self._faults)
 
+    def deafen(self, count: int = 1) -> None:
+        """The next `count` writes to several servos are lost on their way."""
+        self._deaf = count
+
     def mend(self) -> None:
         with self._lock:
+            self._deaf = 0
             self._faults.clear()
             self._held = b""
 
@@ -180,14 +186,18 @@ class Bus:
     def _serve(self, seen: float, number: int, instruction: int, parameters: bytes, good: bool) -> float:
         """Execute a packet whose last byte the adapter had at `seen`; when its reply was out."""
         with self._lock:
-            self._counts["instructions"] += 1
             baud = self._baud()
+            if not baud:  # unplugged since, or a speed no servo has
+                return seen
+            self._counts["instructions"] += 1
             arrived = seen + (len(parameters) + 6) * 10.0 / baud
             _sleep_until(arrived)
             there = [servo for place, servo in self._servos.items() if place > 0]
             heard = {servo.number: servo for servo in there if BAUDS.get(servo.table[Register.BAUD]) == baud}
             if number == BROADCAST:
-                if good:
+                if self._deaf:
+                    self._deaf -= 1
+                elif good:
                     self._broadcast(heard, instruction, parameters)
                 return arrived
             if number not in heard:
