@@ -17,7 +17,7 @@ class Field:
 
     ``path`` leads to it from the axis (CONTRACT 3 ``axes``), ``text`` is its name's key in the texts, ``unit`` what it
     is printed in, after multiplying by ``factor``. A measured one is an object with its own uncertainties, which give
-    its digits; any other has ``decimals``.
+    its digits; one that is an ``uncertainty`` itself has two significant digits; any other has ``decimals``.
     """
 
     path: tuple[str, ...]
@@ -25,10 +25,11 @@ class Field:
     unit: str
     factor: float = 1.0
     decimals: int | None = None
+    uncertainty: bool = False
 
     @property
     def measured(self) -> bool:
-        return self.decimals is None
+        return self.decimals is None and not self.uncertainty
 
     def of(self, axis: Mapping[str, Any]) -> float | None:
         """The number in its stored unit; None where this axis has no such figure."""
@@ -42,6 +43,8 @@ class Field:
         value = self.of(axis)
         if value is None:
             return "–"
+        if self.uncertainty:
+            return two_digits(value * self.factor) if value > 0 else "0"
         if not self.measured:
             return f"{value * self.factor:.{self.decimals}f}"
         node: Any = axis
@@ -50,21 +53,26 @@ class Field:
         return concise(value * self.factor, node["standard_uncertainty"] * self.factor)
 
 
+TEST_DECIMALS = {"rate": 4, "position": 3}
+"""Of a test's errors: a mean of 20 readings is good to some 0.005 deg/s, and to 0.02 deg."""
+
+
 def _test(kind: str, unit: str) -> tuple[Field, ...]:
-    figures = (
+    decimals = TEST_DECIMALS[kind]
+    figures: tuple[tuple[str, str, int | None], ...] = (
         ("nonlinearity_pct_fs", "%FS", 3),
         ("repeatability_pct_fs", "%FS", 3),
-        (f"max_linearity_error_{unit}", "", 4),
-        (f"max_bias_error_{unit}", "", 4),
-        (f"max_random_error_{unit}", "", 4),
-        (f"max_standard_deviation_{unit}", "", 4),
-        (f"uncertainty_type_a_{unit}", "", 5),
-        (f"uncertainty_type_b_{unit}", "", 5),
+        (f"max_linearity_error_{unit}", "", decimals),
+        (f"max_bias_error_{unit}", "", decimals),
+        (f"max_random_error_{unit}", "", decimals),
+        (f"max_standard_deviation_{unit}", "", decimals),
+        (f"uncertainty_type_a_{unit}", "", None),
+        (f"uncertainty_type_b_{unit}", "", None),
     )
     shown = {"dps": "deg/s", "deg": "deg"}[unit]
     return tuple(
-        Field((kind, name), f"figure.{name.removesuffix('_' + unit)}", given or shown, decimals=decimals)
-        for name, given, decimals in figures
+        Field((kind, name), f"figure.{name.removesuffix('_' + unit)}", given or shown, 1.0, places, places is None)
+        for name, given, places in figures
     )
 
 

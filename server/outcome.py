@@ -87,7 +87,8 @@ def tell(outcome: Outcome, lang: str, *, as_json: bool) -> None:
     elif outcome["error"] is None:
         print("\n".join(_lines(outcome, lang)), flush=True)
     if outcome["error"] is not None:
-        print(": ".join(filter(None, (outcome["file"], outcome["error"]))), file=sys.stderr, flush=True)
+        named = outcome["file"] is None or outcome["error"].startswith(outcome["file"])
+        print(outcome["error"] if named else f"{outcome['file']}: {outcome['error']}", file=sys.stderr, flush=True)
 
 
 def _lines(outcome: Outcome, lang: str) -> list[str]:
@@ -95,11 +96,8 @@ def _lines(outcome: Outcome, lang: str) -> list[str]:
     rows = [("", "", *(render("certificate.axis", {"axis": axis}, lang) for axis in axes))]
     for field in FIELDS:
         if any(field.of(figures) is not None for figures in axes.values()):
-            kind = (
-                render(f"certificate.{field.path[0]}", {}, lang) + ": " if field.path[0] in ("rate", "position") else ""
-            )
             written = (field.written(figures) for figures in axes.values())
-            rows.append((kind + render(field.text, {}, lang), field.unit, *written))
+            rows.append((documents.figure_name(field, lang), field.unit, *written))
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     verdict = render(f"outcome.{outcome['verdict']}", {}, lang)
     lines = [render("outcome.board", {**outcome, "verdict": verdict}, lang), ""]

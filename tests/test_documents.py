@@ -45,6 +45,7 @@ def test_the_pdf_says_who_what_when_how_and_how_sure_on_two_pages(content: dict[
         "Certificate of calibration", "GB-2026-00042", BOARD, "Ada", "24.5 °C", "2026-11-22 06:10 – 06:55 UTC",
         "2026-11-22 07:10 UTC", "gyrobench 0.", "standard", "Simulated bench", "Reference not calibrated",
         "Fail: 1 of 2 limits of “lab 2026”", "relate only to the item", "Decision rule", "Authorised by",
+        "x Rate test: Non-linearity, %FS ≤ 0",
         "End of certificate", "page 2 of 2", "3 readings at each repeat set-point instead of the 22",
     ):  # fmt: skip
         assert words in said, words
@@ -97,6 +98,14 @@ def test_the_csv_holds_every_certified_number_and_every_reading(content: dict[st
             assert float(results[axis, ".".join(field.path)]["value"]) == field.of(figures)
     bias = results["x", "bias_V"]
     assert float(bias["standard_uncertainty"]) == content["axes"]["x"]["bias_V"]["standard_uncertainty"]
+    limits = [
+        (row["section"], row["name"], float(row["value"]), row["unit"]) for row in rows if "limit" in row["section"]
+    ]
+    assert limits == [
+        ("limit met", "bias_V.value.min", 1.2, "V"),
+        ("limit met", "bias_V.value.max", 1.3, "V"),
+        ("limit not met", "rate.nonlinearity_pct_fs.max", 0.0, "%FS"),
+    ]
     readings = [row for row in rows if row["section"] == "rate_x/repeat" and row["name"] == "gyro"]
     assert len(readings) == 6 * 3
 

@@ -19,5 +19,5 @@ async def thesis(here: Here) -> models.Answer:
 
 @router.get("/fields", summary="The certified numbers: where each stands, its name's text, its unit")
 def fields() -> dict[str, list[dict[str, Any]]]:
-    names = ("path", "text", "unit", "factor", "decimals")
+    names = ("path", "text", "unit", "factor", "decimals", "uncertainty")
     return {"items": [{name: getattr(field, name) for name in names} for field in FIELDS]}

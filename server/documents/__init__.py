@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from calib_core.certificate import TEST_DECIMALS, Field
 from calib_core.problem import Problem
 from server import texts
 
@@ -15,6 +16,12 @@ def warning_sentence(warning: Mapping[str, Any], lang: str = "en") -> str:
     """What a warning says, with the state it is about."""
     state = f"{texts.render('state.' + warning['state'], {}, lang)}: " if "state" in warning else ""
     return state + texts.render(f"warning.{warning['code']}", warning["values"], lang)
+
+
+def figure_name(field: Field, lang: str = "en") -> str:
+    """The name of a certified number with the test that it is from: `Rate test: Bias error`."""
+    test = field.path[0] if field.path[0] in TEST_DECIMALS else None
+    return (f"{texts.render(f'certificate.{test}', {}, lang)}: " if test else "") + texts.render(field.text, {}, lang)
 
 
 def render(content: Mapping[str, Any], kind: str, lang: str = "en") -> bytes:

@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from calib_core.certificate import FIELDS
+from calib_core.certificate import FIELDS, MEASURED
 from server.documents import warning_sentence
 
 COLUMNS = (
@@ -44,6 +44,12 @@ def _rows(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for test, points in state.get("points", {}).items():
             for point in points:
                 yield from _point(name, state, test, point)
+    for limit in content["judgement"]:
+        row = {"section": "limit met" if limit["ok"] else "limit not met", "axis": limit["axis"]}
+        row["unit"] = _unit(next(key for key in reversed(limit["path"]) if key not in MEASURED))
+        for bound in ("min", "max"):
+            if limit[bound] is not None:
+                yield row | {"name": ".".join([*limit["path"], bound]), "value": limit[bound]}
     for warning in content["warnings"]:
         yield {
             "section": "warning",

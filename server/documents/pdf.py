@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib_core.certificate import FIELDS, Field, two_digits
-from server.documents import warning_sentence
+from calib_core.certificate import FIELDS, TEST_DECIMALS, Field, two_digits
+from server.documents import figure_name, warning_sentence
 from server.texts import render
 
 TEMPLATE = Path(__file__).with_name("certificate.typ")
@@ -204,15 +204,15 @@ def _repeats(content: Mapping[str, Any], lang: str) -> Iterator[dict[str, Any]]:
                 "set_point": render("certificate.repeats.set_point", {"unit": unit}, lang),
                 "bias_error": render("certificate.repeats.bias_error", {}, lang),
                 "random_error": "2·S",
-                "rows": [[signed(f"{at:g}"), *_errors(at, of_axis)] for at in set_points],
+                "rows": [[signed(f"{at:g}"), *_errors(at, of_axis, TEST_DECIMALS[kind])] for at in set_points],
             }
 
 
-def _errors(set_point: float, of_axis: Sequence[Mapping[float, Mapping[str, Any]]]) -> Iterator[str]:
+def _errors(set_point: float, of_axis: Sequence[Mapping[float, Mapping[str, Any]]], decimals: int) -> Iterator[str]:
     for points in of_axis:
         for name in ("bias_error", "random_error"):
             value = points.get(set_point, {}).get(name)
-            yield "–" if value is None else signed(f"{value:.4f}")
+            yield "–" if value is None else signed(f"{value:.{decimals}f}")
 
 
 def _limits(content: Mapping[str, Any], lang: str) -> Iterator[list[str]]:
@@ -223,7 +223,7 @@ def _limits(content: Mapping[str, Any], lang: str) -> Iterator[list[str]]:
         )
         bounds = [f"≥ {low}" if low else "", f"≤ {high}" if high else ""]
         outcome = render(f"certificate.limits.{'ok' if row['ok'] else 'not_ok'}", {}, lang)
-        name = f"{row['axis']}  {render(field.text, {}, lang)}, {field.unit}"
+        name = f"{row['axis']}  {figure_name(field, lang)}, {field.unit}"
         yield [
             name,
             signed(", ".join(filter(None, bounds))),

@@ -1,7 +1,7 @@
 // A state's result as a table, beside the datasheet where the datasheet says something.
 
 import { facts, h, table } from "./dom.js";
-import { figureAt, figures } from "./figures.js";
+import { figureAt, figures, fullName } from "./figures.js";
 import { UNIT, split, stateName } from "./states.js";
 import { decimals, fixed, minus, plain, sentence, signed, t, withUncertainty } from "./text.js";
 
@@ -37,7 +37,7 @@ export function estimateSummary(axis, result) {
   return [
     [axis, h("span", {}, h("span", { class: "muted small" }, `${bias[0]} `), bias[1].n)],
     ["", h("span", {}, h("span", { class: "muted small" }, `${scale[0]} `), scale[1].n)],
-    ["", h("span", { class: "muted small" }, t("result.datasheet_says", { value: scale[4].n, off: scale[5].n }))],
+    ["", h("span", { class: "muted small" }, t("result.datasheet_says", { value: `${scale[4].n} mV/(deg/s)`, off: scale[5].n }))],
   ];
 }
 
@@ -50,7 +50,7 @@ function conditions({ delay_s: delay, noise, kalman, step_check: step }) {
   return facts([
     [t("figure.delay"), delay?.value == null ? null : `${withUncertainty(ms(delay.value), ms(delay.standard_uncertainty))} ms`],
     [t("result.noise"), noise ? `${fixed(noise.white_dps, 3)} deg/s` : null],
-    [t("result.gain"), kalman ? `K₁ ${fixed(kalman.k1, 1)}, K₂ ${fixed(kalman.k2, 2)}` : null],
+    [t("result.gain"), kalman ? `K₁ ${fixed(kalman.k1, 1)} s⁻², K₂ ${fixed(kalman.k2, 2)} s⁻¹` : null],
     [t("result.noise_ratio"), kalman?.noise_ratio == null ? null : fixed(kalman.noise_ratio, 2)],
     [t("result.whiteness"), kalman?.whiteness_p == null ? null : kalman.whiteness_p < 0.001 ? "p < 0.001" : `p = ${fixed(kalman.whiteness_p, 3)}`],
     [t("result.filterpy"), kalman?.filterpy_difference == null ? null : `${minus(kalman.filterpy_difference.toExponential(1))} V`],
@@ -73,9 +73,9 @@ export function budgetTable(budget) {
 export function limitsCard(certificate) {
   if (!certificate?.judgement?.length) return null;
   const row = ({ axis, path, min, max, value, ok }) => {
-    const { text, unit, factor } = figureAt(path);
-    const number = (x) => ({ n: x == null ? "" : plain(x * factor) });
-    return [`${axis} ${t(text)}, ${unit}`, number(value), number(min), number(max), ok ? t("certificate.limits.ok") : h("strong", { class: "failed" }, t("certificate.limits.not_ok"))];
+    const figure = figureAt(path);
+    const number = (x) => ({ n: x == null ? "" : plain(x * figure.factor) });
+    return [`${axis} ${fullName(figure)}, ${figure.unit}`, number(value), number(min), number(max), ok ? t("certificate.limits.ok") : h("strong", { class: "failed" }, t("certificate.limits.not_ok"))];
   };
   return h("section", { class: "panel stack wide" },
     h("h2", {}, t("certificate.spec", { name: certificate.spec.name ?? "" })),
@@ -101,10 +101,13 @@ export function resultCard(state, result, { actions = [], level = "h2" } = {}) {
     ...warnings(result.warnings));
 }
 
+/** As many as the certificate has: a mean of 20 readings is good to some 0.005 deg/s, and to 0.02 deg. */
+const DECIMALS = { rate: 4, position: 3 };
+
 /** Thesis 5.3 to 5.6 and 5.11 to 5.14: the line, set-point by set-point. */
 export function linearityTable(rows, kind) {
   return table([t("table.set_point"), ...["encoder", "mean", "fit", "residual"].map((key) => ({ n: t(`table.${key}`) }))].map(withUnit(kind)),
-    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.fit, row.residual].map((value) => ({ n: fixed(value, 4) }))]),
+    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.fit, row.residual].map((value) => ({ n: fixed(value, DECIMALS[kind]) }))]),
     { compact: true, label: t("table.linearity") });
 }
 
@@ -113,7 +116,7 @@ export function repeatTable(rows, kind) {
   const keys = ["encoder", "mean", "standard_deviation", "bias_error", "random_error"];
   const readings = (row) => h("span", { class: "readings" }, row.readings.flatMap((value, i) => [h(row.used[i] ? "span" : "s", {}, fixed(value, 3)), " "]));
   return table([...[t("table.set_point"), ...keys.map((key) => ({ n: t(`table.${key}`) }))].map(withUnit(kind)), t("table.readings")],
-    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.standard_deviation, row.bias_error, row.random_error].map((value) => ({ n: fixed(value, 4) })), readings(row)]),
+    rows.map((row) => [{ n: signed(row.set_point, 0) }, ...[row.reference, row.mean, row.standard_deviation, row.bias_error, row.random_error].map((value) => ({ n: fixed(value, DECIMALS[kind]) })), readings(row)]),
     { compact: true, label: t("table.repeat") });
 }
 
