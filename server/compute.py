@@ -7,6 +7,7 @@ import asyncio
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -61,6 +62,15 @@ def _begin() -> None:
     # The small matrices of this work are slower with two threads than with one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is the server's; it ends this process in order
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A server that is killed cannot say so, and a process of a pool waits for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, str] | None, board: str | None) -> str:
@@ -70,10 +80,11 @@ def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, st
 
     with file.open("rb") as opened:
         recording = read(opened, name=name, mapping=mapping)
+    board = board or recording.header.get("board", "")
     with Store(data) as store:
         if board:
             store.boards.ensure(board)
-        return store.recordings.add(recording, board=board or recording.header.get("board", ""), name=name)
+        return store.recordings.add(recording, board=board, name=name)
 
 
 def export_recording(data: Path, recording: str, form: str, file: Path) -> None:

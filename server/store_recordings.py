@@ -93,7 +93,7 @@ class Recordings:
         found = self._at.rows(f"{SELECT} where id = ?", [recording])
         if not found:
             raise Problem("recording.not_found", recording=recording)
-        row = _shown(found[0])
+        row = self._shown(found[0])
         del row["at"]
         return row
 
@@ -108,7 +108,7 @@ class Recordings:
             where.append("board = ?")
             values.append(board)
         rows, following = page(self._at, SELECT, where, values, limit, cursor)
-        return [_shown(row) for row in rows], following
+        return [self._shown(row) for row in rows], following
 
     def load(self, recording: str, *, kind: str = "rows", state: str | None = None) -> Recording:
         """What is stored, as one Recording; raises Problem where there are no such rows."""
@@ -122,6 +122,14 @@ class Recordings:
         joined = Recording.join([unpack_recording(row["data"]) for row in blocks])
         return Recording(joined.time_s, joined.columns, joined.segment_codes, joined.segment_names, header)
 
-
-def _shown(row: Row) -> Row:
-    return {**row, "header": json.loads(row["header"])}
+    def _shown(self, row: Row) -> Row:
+        row = {**row, "header": json.loads(row["header"])}
+        if row["digest"] is None:  # not sealed: a run is on, or was interrupted; counted as it stands
+            where = "from blocks where recording = ? and kind = 'rows'"
+            first = f"(select data {where} order by id limit 1) as first"
+            sql = f"select sum(samples) as n, max(end_s) as last, {first} {where}"
+            (found,) = self._at.rows(sql, [row["id"], row["id"]])
+            if found["n"]:
+                begin_s = float(unpack_recording(found["first"]).time_s[0])
+                row |= {"samples": found["n"], "duration_s": round(found["last"] - begin_s, 3)}
+        return row

@@ -130,6 +130,15 @@ def test_two_processes_never_give_one_number_twice(tmp_path: Path) -> None:
     assert len(set(numbers)) == 12
 
 
+def test_a_recording_that_nobody_sealed_is_counted_as_it_stands(store: Store) -> None:
+    made = recording(store)
+    shown = store.recordings.row(made)
+    assert (shown["samples"], shown["duration_s"], shown["digest"]) == (500, 4.99, None)
+    assert store.recordings.find()[0][0]["samples"] == 500
+    empty = store.recordings.create(board="LPY-1", name="LPY-1", source="run", header={})
+    assert (store.recordings.row(empty)["samples"], store.recordings.row(empty)["duration_s"]) == (0, 0.0)
+
+
 # --- faults ----------------------------------------------------------------------------------------------------
 def test_a_full_disk_is_a_sentence_and_leaves_no_half_row(store: Store) -> None:
     made = recording(store)
