@@ -19,8 +19,9 @@ def form_of(path: Path) -> str:
 
 
 def save(recording: Recording, path: Path) -> None:
-    """Writes ``path`` whole or not at all."""
+    """Writes ``path`` whole or not at all; its directory is made where there is none."""
     form = form_of(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:

@@ -17,7 +17,9 @@ from shared import ROOT
 from calib_core.recording import read, write_csv
 from server import cli
 from server.store import Store
+from server.store_db import Connection
 from server.store_recordings import Recordings
+from server.store_runs import Runs
 
 COMMAND = ("calibrate", "--board", "LPY-1", "--readings", "5", "--speed", "max", "--seed", "1", "--operator", "Ada")
 
@@ -131,11 +133,16 @@ def test_a_certificate_is_verified_from_its_recording_and_a_changed_one_is_not(
     assert cli.main(["verify", calibrated["documents"]["json"], *data]) == 0
     assert "valid" in capsys.readouterr().out
     content = json.loads(Path(calibrated["documents"]["json"]).read_text(encoding="utf-8"))
-    content["axes"]["x"]["bias_V"]["value"] += 1e-6
+    content["axes"]["x"]["bias_V"]["value"] += 1e-8
+    content["software"]["version"] = "0.0.1"
     forged = tmp_path / "forged.json"
     forged.write_text(json.dumps(content), encoding="utf-8")
     assert cli.main(["verify", str(forged), *data]) == 1
-    assert "axes.x.bias_V.value" in capsys.readouterr().out
+    _, first, version = capsys.readouterr().out.splitlines()
+    path, _, certified, _, computed = first.replace(",", "").split()
+    assert path == "axes.x.bias_V.value:"
+    assert certified != computed
+    assert "0.0.1" in version
     elsewhere = ["--data", str(tmp_path / "empty")]
     assert cli.main(["verify", calibrated["documents"]["json"], *elsewhere]) == 1
     assert "--recording" in capsys.readouterr().out
@@ -156,6 +163,7 @@ def test_one_bad_file_among_several_is_told_and_the_others_are_certified(
     assert "4" in outcomes[0]["error"]
     assert "none.csv" in outcomes[1]["error"]
     assert len(said.err.splitlines()) == 2
+    assert said.err.count("none.csv") == 1
     with Store(tmp_path) as store:
         assert len(store.recordings.find()[0]) == 1
 
@@ -200,6 +208,22 @@ def test_the_exported_recording_names_what_it_was_made_with(exported: Path) -> N
     assert header["profile"] == "standard"
     assert header["seed"] == "1"
     assert json.loads(header["gyro_model"])["id"] == "LPY503AL-OUT"
+
+
+def test_a_full_disk_is_told_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(store: Connection) -> None:
+        store.db.execute(f"pragma max_page_count = {store.db.execute('pragma page_count').fetchone()[0]}")
+
+    create = Runs.create
+    monkeypatch.setattr(Runs, "create", lambda runs, **given: (create(runs, **given), full(runs._at))[0])
+    words = ["calibrate", "--board", "S", "--readings", "3", "--data", str(tmp_path), "--out", str(tmp_path)]
+    assert cli.main(words) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("The disk is full")
+    assert said.err.count("\n") == 1
 
 
 def test_ctrl_c_stops_the_run_keeps_its_samples_and_says_so(

@@ -60,7 +60,7 @@ def test_samples_at_1_khz_are_exported_beside_the_rows(tmp_path: Path, capsys: p
 
 
 def test_a_file_is_converted_without_a_store(foreign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mapped, again = tmp_path / "mapped.parquet", tmp_path / "again.csv"
+    mapped, again = tmp_path / "mapped.parquet", tmp_path / "new" / "again.csv"
     code, out, _ = run(capsys, "import", foreign, *MAP, "--header", "reference=stationary", "--out", mapped)
     assert code == 0
     assert "210 rows" in out

@@ -1,6 +1,7 @@
 """`gyrobench calibrate`: the six states without a browser, the same way as the worker runs them."""
 
 import argparse
+import logging
 import signal
 import sys
 import threading
@@ -41,6 +42,8 @@ def main(args: argparse.Namespace) -> int:
     from server import outcome
     from server.devices import DeviceError
 
+    # What ends a run is told in one sentence; the server's log has its traceback as well.
+    logging.getLogger("gyrobench").addHandler(logging.NullHandler())
     try:
         found = outcome.certified(_run(args), Path(args.out), args.lang)
         code = FAILED if found["verdict"] == "fail" else 0

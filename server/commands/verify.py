@@ -32,8 +32,21 @@ def main(args: argparse.Namespace) -> int:
             else:
                 print(render(f"verify.{found['code']}", found, args.lang))
                 for difference in found["differences"]:
-                    print("  " + render("verify.difference", difference, args.lang))
+                    print("  " + render("verify.difference", difference | _apart(**difference), args.lang))
+                versions = found.get("software", {})
+                if found["differences"] and versions["certified"] != versions["computed"]:
+                    print("  " + render("verify.other_version", versions, args.lang))
     return 0 if valid else FAILED
+
+
+def _apart(certified: Any, computed: Any, **_: str) -> dict[str, Any]:
+    """Two numbers with as many digits as tell them apart."""
+    if isinstance(certified, float) and isinstance(computed, float):
+        for digits in range(6, 18):
+            written = {"certified": f"{certified:.{digits}g}", "computed": f"{computed:.{digits}g}"}
+            if written["certified"] != written["computed"]:
+                return written
+    return {}
 
 
 def _verify(store: Any, file: Path, recording_file: str | None) -> dict[str, Any]:
