@@ -168,11 +168,16 @@ class SampleSize:
     def enough(self) -> bool:
         return self.used >= self.needed
 
-    def to_json(self) -> dict[str, Any]:
-        """CONTRACT keys and the verdict as a sentence's code."""
+    def to_json(self, unit: str) -> dict[str, Any]:
+        """CONTRACT keys and the verdict as a sentence's code; ``unit`` is that of the readings."""
         values = {"ci": self.ci, "d": self.d, "needed": int(np.ceil(self.needed)), "used": self.used, "t": self.t}
         code = "sample_size.enough" if self.enough else "sample_size.not_enough"
-        return {**values, "enough": self.enough, "code": code, "values": {**values, "S": self.standard_deviation}}
+        return {
+            **values,
+            "enough": self.enough,
+            "code": code,
+            "values": {**values, "S": self.standard_deviation, "unit": unit},
+        }
 
 
 def sample_size(standard_deviation: float, ci: float, n: int, t: float | None = None) -> SampleSize:
@@ -215,7 +220,7 @@ class TestResult:
             "slope": lin and lin.line.slope,
             "intercept": lin and lin.line.intercept,
             "full_scale": self.full_scale,
-            "sample_size": size and size.to_json(),
+            "sample_size": size and size.to_json(UNIT[self.kind]),
             "points": {
                 "linearity": [
                     _point(point) | {"fit": point.mean - float(residual), "residual": float(residual)}
@@ -303,7 +308,7 @@ def evaluate(
         told,
     )
     if (size := result.sample_size) and not size.enough:
-        told.append({"code": "test.too_few_repeats", "values": size.to_json()["values"] | {"unit": UNIT[kind]}})
+        told.append({"code": "test.too_few_repeats", "values": size.to_json(UNIT[kind])["values"]})
     return result
 
 

@@ -11,7 +11,7 @@ from shared import ROOT, shared
 
 from calib_core import linearity
 from calib_core.points import Points
-from server.texts import texts
+from server.texts import render, texts
 
 
 def made(test: str, set_points: list[float], readings: list[list[float]]) -> Points:
@@ -52,7 +52,9 @@ def test_a_verdict_follows_every_repeat_test() -> None:
     assert not loud.sample_size.enough
     assert [w["code"] for w in loud.warnings] == ["test.too_few_repeats"]
     quiet = linearity.evaluate(made("repeat", [20.0], [rng.normal(20, 0.01, 22).tolist()]), 200.0, kind="rate")
-    assert quiet.to_json()["sample_size"]["enough"]
+    told = quiet.to_json()["sample_size"]
+    assert told["enough"]
+    assert "±0.125 deg/s" in render(told["code"], told["values"])
     assert not quiet.warnings
 
 
