@@ -14,7 +14,7 @@ from server.store_boards import USUAL_MODEL
 from server.store_db import Row, checked_id
 
 # What a run that repeats some states takes over from the one it continues, unless asked otherwise.
-INHERITED = ("gyro_model", "profile", "readings", "seed", "ranges")
+INHERITED = ("gyro_model", "profile", "readings", "seed", "ranges", "spec")
 
 
 def plan_of(store: Store, request: Mapping[str, Any], axes: Mapping[str, Axis]) -> tuple[dict[str, Any], Plan]:
