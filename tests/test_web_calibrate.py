@@ -95,6 +95,22 @@ def test_reload_and_second_browser_show_the_run_so_far(window: Window, browser: 
     other.close()
 
 
+def test_nothing_moves_under_the_eye_when_the_page_opens(browser: Any, server: Server) -> None:
+    run = server.call("POST", "/runs", {"board": "LPY-0010", "readings": 3})["id"]
+    window = Window(browser, server, viewport=PHONE)
+    window.page.add_init_script(
+        "window.shifted = 0; new PerformanceObserver((list) => { for (const entry of list.getEntries())"
+        " window.shifted += entry.value; }).observe({ type: 'layout-shift', buffered: true });"
+    )
+    for path in ("/", "/rig.html"):
+        page = window.open(path)
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("shifted") < 0.1, path  # "good" as browsers' makers count it
+    window.close()
+    server.call("POST", f"/runs/{run}/stop")
+    server.wait_idle()
+
+
 def test_second_run_is_refused_with_a_sentence_and_the_first_is_shown(browser: Any, server: Server) -> None:
     server.speed(20)
     window = Window(browser, server)

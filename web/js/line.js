@@ -40,8 +40,10 @@ export function soFar(points) {
   return { linearity, repeat: bySetPoint(points, "repeat") };
 }
 
-/** Twice the standard deviation of the residuals of a straight line. */
+/** Two standard uncertainties of a set-point's mean, from the scatter of its readings: the certificate's band. */
 export function twoSigma(linearity) {
-  const residuals = linearity.map((p) => p.residual).filter((r) => r != null);
-  return residuals.length > 2 ? 2 * Math.sqrt(residuals.reduce((sum, r) => sum + r * r, 0) / (residuals.length - 2)) : null;
+  const readings = linearity.reduce((n, p) => n + p.readings.length, 0);
+  const freedom = readings - linearity.length;
+  const squares = linearity.flatMap((p) => p.readings.map((value) => (value - p.mean) ** 2));
+  return freedom > 0 ? 2 * Math.sqrt((squares.reduce((a, b) => a + b, 0) / freedom) * (linearity.length / readings)) : null;
 }

@@ -9,6 +9,7 @@ const PAGES = [
   ["compare", "/compare.html"], ["rig", "/rig.html"], ["thesis", "/thesis.html"],
 ];
 const RIG_EVERY_MS = 5000;
+const SETTLE_MS = 600;
 
 /** The stop comes first and needs nothing else of the page: no texts, no rig, no confirmation. */
 function stopButton() {
@@ -82,7 +83,6 @@ export async function page(name, work) {
     type: "button", lang: code, "aria-pressed": String(code === language), onclick: () => chooseLanguage(code),
   }, word)));
   translate();
-  document.documentElement.dataset.ready = "";
 
   async function lookAtRig() {
     try {
@@ -98,8 +98,12 @@ export async function page(name, work) {
   document.addEventListener("rig-asked", lookAtRig);
   document.addEventListener("token-needed", ({ detail }) => askToken(detail));
   setInterval(() => { if (!document.hidden || api.holdsRig()) lookAtRig(); }, RIG_EVERY_MS);
+  const begun = Promise.all([work(main), lookAtRig()]);
+  // Shown when it has taken its form, so that nothing moves under the eye; but soon, whatever does not answer.
+  await Promise.race([begun.catch(() => {}), new Promise((resolve) => { setTimeout(resolve, SETTLE_MS); })]);
+  document.documentElement.dataset.ready = "";
   try {
-    await Promise.all([work(main), lookAtRig()]);
+    await begun;
   } catch (problem) {
     notice("fault", problem.message, "fail");
     if (problem.status === undefined) throw problem;

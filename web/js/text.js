@@ -30,7 +30,8 @@ export function t(key, values = {}) {
 function word(value, digits) {
   if (Array.isArray(value)) return value.map((item) => word(item, digits)).join(", ");
   if (value?.code) return sentence(value);
-  if (typeof value !== "number") return String(value);
+  // A number that a document printed stays as it was printed, but for its sign.
+  if (typeof value !== "number") return String(value).replace(/^-(?=\d)/, "−");
   return digits === undefined ? plain(value) : fixed(value, Number(digits));
 }
 

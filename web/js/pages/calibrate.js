@@ -9,7 +9,7 @@ import { estimateSummary, limitsCard, resultCard } from "../results.js";
 import { Setup } from "../setup.js";
 import { notice, page, speedWord } from "../shell.js";
 import { STATES, showStates, split, stateName } from "../states.js";
-import { duration, sentence, t } from "../text.js";
+import { duration, plain, sentence, t } from "../text.js";
 
 const FRAME_MS = 45;   // the screen's next picture after this: 20 a second, no more
 const PLAN_AFTER_MS = 300;
@@ -19,12 +19,14 @@ let watched = null;    // id of the run on the page
 let isStarting = false;
 
 page("calibrate", async () => {
+  let seen;
+  const first = new Promise((resolve) => { seen = resolve; });   // the rig's first answer, and the run that is on
   setup = new Setup($("#setup"), { onStart: start, onChange: planSoon });
   document.addEventListener("rig-changed", ({ detail }) => {
     // A run that another browser or the command line started belongs on this page too.
     speed = detail.speed;
     showLength();
-    if (detail.run && detail.run !== watched && !isStarting) follow(detail.run);
+    seen(detail.run && detail.run !== watched && !isStarting ? follow(detail.run) : null);
   });
   $("#stop-run").addEventListener("click", async () => {
     say($("#about-error"), null);
@@ -35,6 +37,7 @@ page("calibrate", async () => {
   const asked = new URLSearchParams(location.search).get("run");
   if (asked) await follow(asked);
   else plan();
+  await first;
 });
 
 // --- before the run ---------------------------------------------------------------------------------------------
@@ -123,7 +126,8 @@ async function follow(id) {
   $("#results").replaceChildren();
   $("#about-facts").replaceChildren(facts([
     [t("setup.board"), h("a", { href: links.board(run.board) }, run.board)], [t("setup.model"), models.find((m) => m.id === run.gyro_model)?.name ?? run.gyro_model],
-    [t("setup.profile"), t(`profile.${run.profile}`)], [t("setup.operator"), run.operator], [t("setup.note"), run.note],
+    [t("setup.profile"), t(`profile.${run.profile}`)], [t("setup.operator"), run.operator],
+    [t("setup.temperature"), run.conditions?.room_temperature_degC == null ? null : plain(run.conditions.room_temperature_degC)], [t("setup.note"), run.note],
     [t("setup.readings"), run.readings], [t("rig.rig"), run.rig], [t("run.seed"), run.seed == null ? null : String(run.seed)],
   ]));
   const plots = livePlots($("#charts"), models.find((model) => model.id === run.gyro_model));

@@ -1,4 +1,4 @@
-// Two boards side by side (thesis tables 5.19 to 5.21), from the newest certificate of each.
+// Two boards side by side (thesis tables 5.19 to 5.21), from the newest certificate of each; or any two certificates.
 
 import { api, links } from "../api.js";
 import { h, say, table } from "../dom.js";
@@ -38,14 +38,18 @@ page("compare", async (main) => {
   else await show();
 });
 
-async function newest(board) {
-  const { items } = await api.certificates({ board, limit: 1 });
-  if (!items.length) throw new Error(t("compare.no_certificate", { board }));
-  return api.certificate(items[0].number);
+/** The newest certificate of a board, or the one with this number. */
+async function newest(word) {
+  const { items } = await api.certificates({ board: word, limit: 1 });
+  if (items.length) return api.certificate(items[0].number);
+  const found = await api.certificates({ q: word, limit: 1 });
+  if (found.items[0]?.number !== word) throw new Error(t("compare.no_certificate", { board: word }));
+  return api.certificate(word);
 }
 
 function tables(first, second) {
-  const head = [t("compare.figure"), ...[first, second].flatMap((c) => ["x", "z"].map((axis) => ({ n: `${c.board} ${axis}` })))];
+  const name = first.board === second.board ? "number" : "board";
+  const head = [t("compare.figure"), ...[first, second].flatMap((c) => ["x", "z"].map((axis) => ({ n: `${c[name]} ${axis}` })))];
   const columns = [first, second].flatMap((c) => ["x", "z"].map((axis) => figures(c.axes[axis] ?? {})));
   const part = (key, isIn) => h("section", { class: "panel stack" }, h("h2", {}, t(`compare.${key}`)), table(head,
     columns[0].map((figure, i) => ({ figure, i })).filter(({ figure }) => isIn(figure.path[0]))
