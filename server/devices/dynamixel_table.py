@@ -136,6 +136,10 @@ class DynamixelTable:
     def axes(self) -> Mapping[str, Axis]:
         return self._axes
 
+    @property
+    def ids(self) -> dict[str, int]:
+        return {axis: servo.number for axis, servo in self._servos.items()}
+
     # --- for callers, from any thread --------------------------------------------------------------------------
     def open(self) -> None:
         """Connect, or look again: torque off, then the servos' set-up. Raises DeviceError."""
@@ -279,7 +283,7 @@ class DynamixelTable:
                 if self.bus.ping(servo.number):
                     raise DeviceError("rig.servo_quiet", axis=axis, id=servo.number) from no
                 raise self._silent(axis, no) from no
-        for fault in faults(setups, {axis: servo.number for axis, servo in self._servos.items()}):
+        for fault in faults(setups, self.ids):
             raise fault
         self.bus.return_delay_s = max(found.return_delay_us for found in setups.values()) * 1e-6
         # A servo that shut itself down has the torque limit 0; writing another is half of its recovery.
@@ -441,8 +445,7 @@ class DynamixelTable:
             self._watch(axis, servo.last)  # a servo that shut itself down takes no goal
         if course.resends >= RESENDS:
             raise DeviceError("rig.command_lost", axis=axis, part=self._axes[axis].part)
-        else:
-            course.resends, course.due_s = course.resends + 1, -math.inf
+        course.resends, course.due_s = course.resends + 1, -math.inf
 
     def _halt(self) -> None:
         """What `safe` asks for."""
