@@ -29,6 +29,8 @@ MOTION_HZ, STILL_HZ = 5.0, 1.0
 """Tables move at up to 4.1 Hz: below the first a line may be motion, below the second drift."""
 DEAF = 0.1
 """Samples that are means over nearly whole periods of the mains, and keep less than this of it, cannot show it."""
+ALONE, LASTING = 1.4, 0.35
+"""Over the strongest line beside the band; the share of the gain without a quarter of the record, 0.75 in the mean."""
 COHERENT_S = 300.0
 SMOOTH_S = 0.02
 """Motion at 4 Hz keeps a hundredth of its size, noise at 20 Hz nearly all."""
@@ -43,6 +45,9 @@ class Hum:
     """The strongest line near a mains frequency, whether it counts or not."""
 
     found: bool
+    """Improbable without hum, and ``steady``."""
+    steady: bool
+    """Whether it is there throughout and alone, unlike harmonics of a motion that a coarse converter sees."""
     two_delta_lnL: float
     p: float
     """Probability of such a line somewhere in the bands of a record without hum."""
@@ -78,7 +83,7 @@ def find_hum(s: Samples, *, moving: bool = True) -> Hum | None:
     if not bands:
         return None
     record = _Record(s)
-    _, start, density = max(record.scan(nominal) for nominal in bands)
+    strongest, start, density, beside = max(record.scan(nominal) for nominal in bands)
     start = min(_images(start, s), key=lambda f: (round(min(abs(f - nominal) for nominal in MAINS_HZ), 6), f))
     frequency, gain, _ = record.refined(start)
     two_delta_lnL = gain / (density * record.response(frequency) ** 2)
@@ -89,9 +94,10 @@ def find_hum(s: Samples, *, moving: bool = True) -> Hum | None:
     single = float(fdtrc(2 * pieces, 2 * record.duration_s, two_delta_lnL / (2 * pieces)))
     trials = OVERSAMPLING * len(bands) * 2.0 * BAND_HZ * record.duration_s / pieces
     p = float(-np.expm1(trials * np.log1p(-min(single, 0.5))))
+    steady = strongest > ALONE * beside and record.lasting(frequency) > LASTING
     # The estimate has weights that neither the line nor the noise that rides on it has a part in.
     record.weigh(frequency)
-    _, _, density = record.scan(min(MAINS_HZ, key=lambda nominal: abs(nominal - frequency)))
+    _, _, density, _ = record.scan(min(MAINS_HZ, key=lambda nominal: abs(nominal - frequency)))
     frequency, _, bend = record.refined(frequency)
     lines, covariance = record.lines(frequency)
     noise = density * record.response(frequency) ** 2
@@ -100,7 +106,8 @@ def find_hum(s: Samples, *, moving: bool = True) -> Hum | None:
     power = float(np.mean(np.abs(lines) ** 2)) - (2.0 * noise * float(covariance.mean()) if pieces > 1 else 0.0)
     first = complex(lines[0] * undo) if pieces == 1 else complex(np.nan, np.nan)
     return Hum(
-        found=p < FALSE_ALARM,
+        found=p < FALSE_ALARM and steady,
+        steady=steady,
         two_delta_lnL=two_delta_lnL,
         p=p,
         frequency_hz=frequency,
@@ -153,8 +160,9 @@ class _Record:
         # A stretch that seems far quieter than the rest is stuck, not good.
         self.weight = self.taper * self.whole / np.maximum(unrest, 0.1 * typical)[part] / len(rest)
 
-    def scan(self, nominal: float) -> tuple[float, float, float]:
-        """Of the strongest line in the band: gain over noise, frequency, and the noise density beside the band."""
+    def scan(self, nominal: float) -> tuple[float, float, float, float]:
+        """Of the strongest line in the band: gain over noise and frequency; beside the band: noise density, and the
+        strongest line's gain over noise."""
         width = self.samples.interval_s * max(1, int(BIN_S / self.samples.interval_s))
         bins = (self.time / width).astype(np.int64)
         turn = np.exp(-2j * np.pi * nominal * self.time)
@@ -179,7 +187,19 @@ class _Record:
         density = float(np.median(ratio[beside]) / (2.0 * gammaincinv(self.pieces, 0.5)))
         inside = np.flatnonzero(near <= BAND_HZ)
         best = inside[np.argmax(ratio[inside])]
-        return float(ratio[best] / density), float(frequency[best]), density
+        return float(ratio[best] / density), float(frequency[best]), density, float(ratio[beside].max() / density)
+
+    def lasting(self, frequency: float) -> float:
+        """The share of the line's gain that is left without the two strongest of eight parts of equal weight."""
+        z = self.weight * self.quick * np.exp(-2j * np.pi * frequency * self.time)
+        along = np.cumsum(self.weight)
+        part = np.minimum((8.0 * along / along[-1]).astype(np.int64), 7)
+        parts = np.bincount(part, z.real, 8) + 1j * np.bincount(part, z.imag, 8)
+        if self.pieces > 1:
+            parts = np.abs(parts)
+        # In the phase of the whole, what each part adds to its size; the gain goes with the square of the size.
+        size = np.sort((parts * np.exp(-1j * np.angle(parts.sum()))).real)
+        return float((max(size[:6].sum(), 0.0) / size.sum() * 8.0 / 6.0) ** 2 * 6.0 / 8.0)
 
     def _responses(self, frequency: F64) -> F64:
         """(k,) by interpolation: the response is smooth."""

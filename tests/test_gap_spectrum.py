@@ -124,6 +124,19 @@ def test_without_hum_the_stated_probability_is_kept(phi: float) -> None:
     assert np.sum(np.array(p) < 0.1) <= 9  # of 40; 10 or more would happen once in 4000
 
 
+def test_a_strong_line_of_one_stretch_or_one_of_many_is_not_hum() -> None:
+    rng = np.random.default_rng(8)
+    time = np.arange(20000) / 100.0
+    noise = 1.25 + rng.normal(0.0, NOISE_V, len(time))
+    passing = 2e-3 * np.sin(2.0 * np.pi * 40.0 * time) * ((time > 60.0) & (time < 72.0))
+    many = sum(4e-4 * np.sin(2.0 * np.pi * f * time + f) for f in np.arange(37.0, 44.0, 0.5))
+    for line in (passing, many):
+        codes = np.zeros(len(time), np.int32)
+        hum = found(samples(Recording(time, {"x_gyro_v": noise + line}, codes, ("",)), "x"))
+        assert hum.p < 1e-6
+        assert not hum.found
+
+
 def test_a_line_among_the_motion_or_on_zero_is_not_looked_for() -> None:
     assert visible(made(7, rate_hz=19.0)) == ()
     assert visible(made(7, rate_hz=20.0)) == (50.0,)
