@@ -23,6 +23,7 @@ from calib_core.problem import Problem
 from calib_core.recording import Recording
 from calib_core.sequence import Plan, State
 from server import __version__
+from server.devices.rehearsal import rehearse
 from server.devices.rig import ROW_S, Rig
 
 F64 = NDArray[np.float64]
@@ -189,6 +190,7 @@ def _run(
     try:
         yield Start(**stamp(), plan=plan.to_json(), seed=plan.seed, duration_s=plan.duration_s)
         rig.mount(board, plan.gyro_model)
+        rehearse(rig, board, plan.gyro_model, abort)
         rig.begin()
         sequence.check(plan, rig.axes)  # again: an open rig knows its supply and so its top speed
         described = {**_header(plan, board), **rig.header, **header}

@@ -100,6 +100,7 @@ class Rig:
         """`one_way_s`: how much earlier than they were the clocks alone make the encoders' readings seem, if known."""
         self.url, self.table, self.daq, self.simulated = url, table, daq, simulated
         self.connected = False
+        self.rehearsed: str | None = None  # the board that the table was last turned slowly with
         self._faults: dict[str, DeviceError] = {}
         self._mount, self._ended, self._heat, self._one_way_s = mount, ended, heat, one_way_s
         self._begun, self._starting = False, Lock()
