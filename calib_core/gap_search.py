@@ -85,8 +85,10 @@ class Search:
         best: dict[str, Suspicion] = {}
         for term, place in zip(terms, places[len(kept) :], strict=True):
             gain, sure = gram.gain(projected, place, term)
-            if not np.isfinite(gain) or (term.effect.positive and projected[place[0], 0] < 0.0):
+            if not np.isfinite(gain):
                 continue
+            if gain < 0.0 or (term.effect.positive and projected[place[0], 0] < 0.0):
+                gain = sure = 0.0  # tested, and the record speaks against it
             z, least = (float(equivalent_z(g, len(place))) for g in (gain, sure))
             found = Suspicion(term, gain, z, least)
             if term.name not in best or found.z > best[term.name].z:

@@ -81,8 +81,10 @@ class Covariates:
         from scipy.signal import lfilter
 
         pole = np.exp(-self.interval_s / tau_s)
-        state = self.memory.get(key, np.array([pole * values[0]]))
-        out, self.memory[key] = lfilter([1.0 - pole], [1.0, -pole], values, zi=state)
+        # Between samples the input is taken as the mean of the two: a step held for one sample would lag by half of it.
+        gain = (1.0 - pole) / 2.0
+        state = self.memory.get(key, np.array([(1.0 - gain) * values[0]]))
+        out, self.memory[key] = lfilter([gain, gain], [1.0, -pole], values, zi=state)
         return np.asarray(out)
 
 

@@ -75,6 +75,10 @@ class _Path:
         name = "sine:" + "+".join(f"{f:g}" for f in frequencies)
         self.add(name, np.zeros_like(rate) if other else rate, other=rate if other else None)
 
+    @property
+    def turned_deg(self) -> float:
+        return float(sum(rate.sum() for rate in self.parts[self.moving])) / FINE_HZ
+
     def done(self) -> Motion:
         rates = {axis: np.concatenate(parts) for axis, parts in self.parts.items()}
         for tau in self.servo_s:
@@ -129,6 +133,7 @@ def second_plan(axis: str, rng: np.random.Generator, *, locked: bool) -> Motion:
     path.go(-here, 40)
     path.hold(1.0)
     path.wave([1.8, 1.2], [base[3], base[2]], 14.0)
+    path.go(-path.turned_deg, 10)
     path.hold(6)
     return path.done()
 
@@ -159,11 +164,12 @@ def one_rate_plan(axis: str) -> Motion:
 
 
 def _lag(signal: F64, tau_s: float) -> F64:
-    """First-order lag at 1 kHz, exact for a signal that is straight between samples' means."""
+    """First-order lag at 1 kHz of a signal that is a straight line between samples; starts settled."""
     from scipy.signal import lfilter
 
     a = np.exp(-1 / (FINE_HZ * tau_s))
-    return np.asarray(lfilter([1 - a], [1, -a], signal, zi=[a * signal[0]])[0])
+    half = (1 - a) / 2
+    return np.asarray(lfilter([half, half], [1, -a], signal, zi=[(1 - half) * signal[0]])[0])
 
 
 def _direction(rate: F64) -> F64:
@@ -362,18 +368,20 @@ def record(
     white_V: float = 1.2e-3,
     ar1_V: float = 0.0,
     phi: float = 0.0,
+    board: tuple[float, float] | None = None,
 ) -> Record:
     """One recording at 100 Hz with the ``effects`` (name: strength) hidden in ``axis``.
 
     ``plan`` is ``first``, ``second``, ``sine`` or ``one_rate``, ``locked`` ties the sines to the sample clock, with
     ``warming`` temperature rises steadily, ``reference`` is ``encoder`` (quantised to 0.2933 deg) or ``rate`` (exact).
-    Noise is white plus AR(1) with ``phi`` at 100 Hz.
+    Noise is white plus AR(1) with ``phi`` at 100 Hz. ``board`` is bias and scale factor, where not drawn.
     """
     rng = np.random.default_rng(np.random.SeedSequence([20261122, seed]))
     motion = _motion(plan, axis, rng, locked=locked)
     other = "z" if axis == "x" else "x"
     bias = float(rng.uniform(1.235, 1.285))
     scale = SCALE_FACTOR * float(rng.uniform(0.96, 1.04))
+    bias, scale = board or (bias, scale)
     per_row = FINE_HZ // ROW_HZ
     rate, other_rate = motion.rate_dps[axis], motion.rate_dps[other]
     t = np.arange(len(rate)) / FINE_HZ
@@ -414,7 +422,8 @@ def record(
         limit = scale * world.clip_dps
         clipped = np.abs(clean - bias) >= limit
         measured = np.round(np.clip(clean + noise, bias - limit, bias + limit) / ADC_STEP_V) * ADC_STEP_V
-    angle = np.round(world.encoder[rows] / ENCODER_STEP_DEG) * ENCODER_STEP_DEG
+    phase = float(rng.uniform(-0.5, 0.5)) * ENCODER_STEP_DEG
+    angle = np.round((world.encoder[rows] + phase) / ENCODER_STEP_DEG) * ENCODER_STEP_DEG
     other_angle = np.round(other_theta[rows] / ENCODER_STEP_DEG) * ENCODER_STEP_DEG
     mean_rate = np.concatenate([[rate[0]], (rate[1:] + rate[:-1]) / 2])[rows]
     names = np.repeat([name for name, _ in motion.segments], [count for _, count in motion.segments])[rows]
@@ -442,6 +451,6 @@ def record(
             "seed": seed,
         },
         gyro_noise_dps=(measured - clean) / scale,
-        encoder_error_deg=angle - world.encoder[rows],
+        encoder_error_deg=angle - phase - world.encoder[rows],
         clipped=clipped,
     )
