@@ -98,18 +98,18 @@ def _lines(outcome: Outcome, lang: str) -> list[str]:
         if any(field.of(figures) is not None for figures in axes.values()):
             written = (field.written(figures) for figures in axes.values())
             rows.append((documents.figure_name(field, lang), field.unit, *written))
-    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
+    widths = [max(map(columns, column)) for column in zip(*rows, strict=True)]
     verdict = render(f"outcome.{outcome['verdict']}", {}, lang)
     lines = [render("outcome.board", {**outcome, "verdict": verdict}, lang), ""]
     for label, unit, *values in rows:
         right = "  ".join(
-            " " * (width - _width(value)) + value for value, width in zip(values, widths[2:], strict=True)
+            " " * (width - columns(value)) + value for value, width in zip(values, widths[2:], strict=True)
         )
-        lines.append(f"  {label}{' ' * (widths[0] - _width(label))}  {right}  {unit}".rstrip())
+        lines.append(f"  {label}{' ' * (widths[0] - columns(label))}  {right}  {unit}".rstrip())
     lines += [f"  ! {warning['sentence']}" for warning in outcome["warnings"]]
     return [*lines, "", *(f"  {path}" for path in outcome["documents"].values())]
 
 
-def _width(text: str) -> int:
+def columns(text: str) -> int:
     """Columns on a terminal: Thai vowels and tone marks stand above or below their letter."""
     return sum(unicodedata.category(letter) != "Mn" for letter in text)

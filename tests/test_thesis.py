@@ -247,3 +247,24 @@ def test_the_printed_figures_here_are_the_published_ones() -> None:
 def read(name: str) -> Iterator[dict[str, str]]:
     with shared(f"thesis/{name}").open(encoding="utf-8") as file:
         yield from csv.DictReader(file)
+
+
+@pytest.mark.parametrize("lang", ["en", "th"])
+def test_every_row_and_place_that_is_not_a_number_has_its_words(found: dict[str, Any], lang: str) -> None:
+    named = [("place", table["table"]) for table in found["tables"]]
+    for row in (row for table in found["tables"] for row in table["rows"]):
+        named += [("row", cell) for cell in (row["row"], row["printed"]) if isinstance(cell, str)]
+    known = texts(lang)
+    missing = {
+        (kind, name)
+        for kind, name in named
+        if re.search("[a-z]{3}", name) and f"thesis_{kind}.{re.sub('[^a-z0-9]+', '_', name.lower())}" not in known
+    }
+    assert missing == set()
+
+
+def test_a_unit_stands_in_the_head_of_its_column_or_beside_each_value(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["thesis", "--seeds", "1"]) == 0
+    said = capsys.readouterr().out
+    for words in ("480 deg/s", "300 x 300 mm", "33.3 mV/(deg/s)", "scale factor, V/(deg/s)"):
+        assert words in said

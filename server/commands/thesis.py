@@ -3,11 +3,13 @@
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from server.texts import render
+from server.outcome import columns
+from server.texts import render, texts
 
 EXAMPLE = "gyrobench thesis --json"
 
@@ -23,7 +25,8 @@ def main(args: argparse.Namespace) -> int:
     progress = _progress(args.lang) if sys.stderr.isatty() else None
     found = report(args.seeds or SEEDS, progress=progress)
     for one in found["disagreements"]:
-        one["sentence"] = render(one["code"], one["values"], args.lang)
+        place = {"table": words("place", one["table"], args.lang)}
+        one["sentence"] = render(one["code"], one["values"] | place, args.lang)
     if args.json:
         print(json.dumps(found, ensure_ascii=False))
     else:
@@ -43,30 +46,47 @@ def lines(report: Mapping[str, Any], lang: str) -> list[str]:
 
 
 def _title(table: Mapping[str, Any], lang: str) -> str:
-    return f"{table['table']}  " + render(table["title"]["code"], table["title"]["values"], lang)
+    return f"{words('place', table['table'], lang)}  " + render(table["title"]["code"], table["title"]["values"], lang)
 
 
 def _grid(rows: Sequence[Mapping[str, Any]], lang: str) -> list[str]:
     """One line a set-point or name, two columns a quantity: printed and recomputed, ≠ where they differ."""
-    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
+    units: dict[str, set[str]] = {}
+    for row in rows:
+        units.setdefault(row["quantity"], set()).add(row["unit"].removeprefix("1"))
     lined: dict[str, dict[str, str]] = {}
     for row in rows:
-        name = " ".join(part for part in (row["board"], row["axis"], row["row"]) if part)
-        lined.setdefault(name, {})[row["quantity"]] = _cell(row)
-    heads = {quantity: render(f"thesis_quantity.{quantity}", {}, lang) for quantity in quantities}
-    width = {q: max(len(heads[q]), *(len(cells.get(q, "")) for cells in lined.values())) for q in quantities}
-    first = max(map(len, lined))
-    table = [" " * first + "".join(f"   {heads[q]:>{width[q]}}" for q in quantities)]
-    return table + [
-        f"{name:<{first}}" + "".join(f"   {cells.get(q, ''):>{width[q]}}" for q in quantities)
-        for name, cells in lined.items()
-    ]
+        # A unit that a column shares stands in its head, any other beside its value.
+        unit = f" {row['unit'].removeprefix('1')}" if len(units[row["quantity"]]) > 1 else ""
+        name = " ".join(part for part in (row["board"], row["axis"], words("row", row["row"], lang)) if part)
+        lined.setdefault(name, {})[row["quantity"]] = (_cell(row, lang) + unit).rstrip()
+    heads = {
+        quantity: ", ".join(filter(None, (render(f"thesis_quantity.{quantity}", {}, lang), *of)))
+        if len(of) == 1
+        else render(f"thesis_quantity.{quantity}", {}, lang)
+        for quantity, of in units.items()
+    }
+    wide = {
+        q: max(columns(head), *(columns(cells.get(q, "")) for cells in lined.values())) for q, head in heads.items()
+    }
+    first = max(map(columns, lined))
+    return [
+        name + " " * (first - columns(name))
+        + "".join("   " + " " * (wide[q] - columns(cells.get(q, ""))) + cells.get(q, "") for q in units)
+        for name, cells in {"": heads, **lined}.items()
+    ]  # fmt: skip
 
 
-def _cell(row: Mapping[str, Any]) -> str:
+def words(kind: str, name: str, lang: str) -> str:
+    """What the thesis' tables call a row or a place, in the reader's language; a number is its own name."""
+    key = f"thesis_{kind}.{re.sub('[^a-z0-9]+', '_', name.lower())}"
+    return render(key, {}, lang) if key in texts("en") else name
+
+
+def _cell(row: Mapping[str, Any], lang: str) -> str:
     printed, recomputed, places = row["printed"], row["recomputed"], row["decimals"]
     if recomputed is None:
-        return f"{printed:g}" if isinstance(printed, float) else str(printed)
+        return f"{printed:g}" if isinstance(printed, float) else words("row", str(printed), lang)
     if printed is None:
         return f"{recomputed:.{places}f}"
     # A mean that lies halfway between two printable numbers is not rounded by its last bit, but as it was printed.
