@@ -122,6 +122,32 @@ def test_rig_page_names_every_part_and_its_state(window: Window) -> None:
     assert "RX-28" in window.text(".parts")
 
 
+def test_the_bench_that_is_chosen_is_asked_for_and_a_refusal_shows_the_rig_that_is_there(
+    browser: Any, server: Server
+) -> None:
+    rig = server.call("GET", "/rig")
+    ports = ["/dev/ttyS7", "/dev/ttyUSB9"]
+    benches = [{"url": f"dynamixel:{port}?ids=1,2+nidaq:Dev1", "label": f"Bench at {port}"} for port in ports]
+    asked: list[Any] = []
+
+    def answer(route: Any) -> None:
+        if route.request.method == "PUT":
+            asked.append(route.request.post_data_json["url"])
+            route.continue_()
+        else:
+            route.fulfill(json={**rig, "ports": ports, "choices": [*rig["choices"], *benches]})
+
+    window = Window(browser, server)
+    window.page.route("**/api/v1/rig", answer)
+    page = window.open("/rig.html")
+    page.select_option("#rig-url", label="Bench at /dev/ttyUSB9")
+    page.wait_for_selector(".error:has-text('/dev/ttyUSB9')")
+    assert asked == [benches[1]["url"]]
+    assert page.input_value("#rig-url") == rig["url"]
+    window.close(refusals=1)
+    server.call("PUT", "/rig", {"url": rig["url"], "speed": rig["speed"]})
+
+
 def test_the_rig_page_checks_the_physics_and_shows_each_check(window: Window, server: Server) -> None:
     page = window.open("/rig.html")
     page.click("#start-check")

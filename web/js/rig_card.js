@@ -34,12 +34,18 @@ export function rigCard(place, { full = false } = {}) {
   async function ask(call) {
     say(error, null);
     check.disabled = true;
-    try { show(await call()); document.dispatchEvent(new Event("rig-asked")); } catch (problem) { say(error, problem); }
+    try { show(await call()); } catch (problem) {
+      say(error, problem);
+      // Shows the rig that the server has now; an address that was typed stays to be corrected.
+      if (choice.value !== OTHER) fill();
+    }
+    document.dispatchEvent(new Event("rig-asked"));
     check.disabled = false;
   }
   const isBench = (address) => address.startsWith("dynamixel:");
+  const PORT = /^dynamixel:([^?+]*)/;
   const address = () => (choice.value === OTHER ? url.value.trim()
-    : isBench(choice.value) && port.value ? choice.value.replace(/^dynamixel:[^?+]*/, `dynamixel:${port.value}`) : choice.value);
+    : isBench(choice.value) && port.value ? choice.value.replace(PORT, `dynamixel:${port.value}`) : choice.value);
   const change = () => {
     portField.hidden = !isBench(choice.value) || !port.options.length;
     urlField.hidden = choice.value !== OTHER;
@@ -48,18 +54,31 @@ export function rigCard(place, { full = false } = {}) {
     speedField.hidden = !isSimulated;
     ask(() => api.chooseRig({ url: address(), ...(isSimulated && { speed: speed.value === "max" ? "max" : Number(speed.value) }) }));
   };
+  choice.addEventListener("change", () => { showPort(choice.value); });
   for (const control of [choice, port, url, speed]) control.addEventListener("change", change);
   check.addEventListener("click", () => ask(() => api.checkRig()));
+
+  /** The port that an address names, even one that is not plugged in now. */
+  function showPort(named) {
+    const wanted = PORT.exec(named)?.[1];
+    const there = rig?.ports ?? [];
+    port.replaceChildren(...[...there, ...(wanted && !there.includes(wanted) ? [wanted] : [])].map((name) => h("option", {}, name)));
+    if (wanted) port.value = wanted;
+  }
 
   function show(next) {
     const isNew = JSON.stringify(next) !== JSON.stringify(rig);
     rig = next;
-    if (!isNew || document.activeElement === url) return;
+    if (isNew && document.activeElement !== url) fill();
+  }
+
+  function fill() {
+    const next = rig;
     const choices = [...next.choices];
     if (!choices.some(({ url: known }) => known === next.url)) choices.push({ url: next.url, label: next.url });
     choice.replaceChildren(...choices.map(({ url: known, label }) => h("option", { value: known }, label)), h("option", { value: OTHER }, t("rig.other")));
     choice.value = next.url;
-    port.replaceChildren(...(next.ports ?? []).map((name) => h("option", {}, name)));
+    showPort(next.url);
     const speeds = SPEEDS.includes(next.speed) || next.speed == null ? SPEEDS : [...SPEEDS, next.speed];
     speed.replaceChildren(...speeds.map((value) => h("option", { value }, speedWord(value))));
     speed.value = next.speed ?? 1;
