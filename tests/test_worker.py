@@ -160,6 +160,17 @@ def queued(store: Store, rig: Rig, **request: Any) -> str:
     return create(store, filled, plan, rig=rig.url, speed=math.inf)
 
 
+def test_a_repeated_state_is_held_to_the_specification_of_the_run_it_continues(tmp_path: Path) -> None:
+    spec = {"axes": {"x": {"bias_V": {"max": 1.3}}}}
+    rig = open_rig("twin:?seed=1")
+    with Store(tmp_path) as store:
+        run = queued(store, rig, spec=spec, readings=4)
+        again = {"board": "LPY-1", "states": ["estimate_x"], "continues": run}
+        filled, plan = plan_of(store, again, rig.axes)
+        assert (filled["spec"], plan.readings) == (spec, 4)
+        assert plan_of(store, {**again, "spec": {**spec, "name": "new"}}, rig.axes)[0]["spec"]["name"] == "new"
+
+
 def test_a_full_disk_ends_the_run_safely_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     watched = WatchedRig()
     with Store(tmp_path) as store:
