@@ -4,7 +4,7 @@ import { api } from "../api.js";
 import { facts, h, say, table } from "../dom.js";
 import { partsList, rigCard } from "../rig_card.js";
 import { page, rigSentence } from "../shell.js";
-import { plain, t } from "../text.js";
+import { fixed, plain, t } from "../text.js";
 
 page("rig", async (main) => {
   const state = h("p", { class: "muted" });
@@ -15,7 +15,7 @@ page("rig", async (main) => {
   main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, physics, limits, holder)));
   const choose = rigCard(card, { full: true });
 
-  const name = h("input", { id: "holder", autocomplete: "name", maxlength: 100 });
+  const name = h("input", { id: "holder", autocomplete: "name", maxlength: 80 });
   const error = h("p", { class: "error", role: "alert" });
   const told = h("p", {});
   const attempt = (work) => async () => {
@@ -52,8 +52,8 @@ page("rig", async (main) => {
     showChecks(rig);
     told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder }) : t("rig.no_lease");
     limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
-      table(["", { n: t("rig.from") }, { n: t("rig.to") }, { n: t("rig.top_speed") }],
-        Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: `${plain(a.min_deg)}°` }, { n: `${plain(a.max_deg)}°` }, { n: `${plain(a.max_rate_dps)} deg/s` }]), { label: t("rig.limits") }));
+      table(["", { n: `${t("rig.from")}, deg` }, { n: `${t("rig.to")}, deg` }, { n: `${t("rig.top_speed")}, deg/s` }],
+        Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: plain(a.min_deg) }, { n: plain(a.max_deg) }, { n: fixed(a.max_rate_dps, 0) }]), { compact: true, label: t("rig.limits") }));
   });
 
   const { items } = await api.gyroModels();
