@@ -165,10 +165,10 @@ def test_load_and_balance_are_watched_while_the_table_steps(gravity_pct: float, 
     way = {"x": 0.0, "z": 0.0}
     start, told = made.table.start, made.table.telemetry
 
-    def noting(motions: tuple[Move, ...]) -> None:
-        start(motions)
+    def noting(motions: tuple[Move, ...]) -> float:
         for move in motions:
             way[move.axis] = 1.0 if move.to_deg > 0 else -1.0
+        return start(motions)
 
     made.table.start = noting
     made.table.telemetry = lambda: {

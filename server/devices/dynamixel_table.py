@@ -156,7 +156,7 @@ class DynamixelTable:
             if self._fault is not None:
                 raise self._fault
 
-    def start(self, motions: Sequence[Motion]) -> None:
+    def start(self, motions: Sequence[Motion]) -> float:
         """Begin these motions together, now; each is checked against its axis first. Raises Problem."""
         now = clock()
         courses = {motion.axis: _Course(motion, now, now + motion.start_s) for motion in motions}
@@ -169,6 +169,7 @@ class DynamixelTable:
             self._new |= courses
             self._read_s = now
             self._changed.notify_all()
+            return now
 
     def read(self) -> dict[str, Readings]:
         """Every good reading since the last call. Raises the fault that ended them."""

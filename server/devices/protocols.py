@@ -46,8 +46,9 @@ class Table(Protocol):
     def open(self) -> None:
         """Connect; torque off first, whatever the last owner left. Raises `DeviceError`."""
 
-    def start(self, motions: Sequence[Motion]) -> None:
-        """Begin these motions together, now; torque on. They replace those going on. Returns at once."""
+    def start(self, motions: Sequence[Motion]) -> float:
+        """Begin these motions together, now; torque on. They replace those going on. Returns at once, with the host's
+        time at which they began."""
 
     def read(self) -> Mapping[str, Readings]:
         """Every good reading since the last call; a failed one is left out, never replaced."""

@@ -207,16 +207,17 @@ class Rig:
 
     def start(self, motions: Sequence[Motion]) -> None:
         """Begin these motions together, now. Raises `DeviceError`, also where the rig was made safe since `begin`."""
-        for motion in motions:
-            shaft = self._shafts[motion.axis]
-            shaft.from_deg = shaft.commanded_deg(self._now_s)
-            shaft.motion, shaft.started_s = motion, self._now_s
-            shaft.low_V, shaft.high_V = np.inf, -np.inf
         with self._asking("servo"), self._starting:
             if not self._begun:
                 raise DeviceError("rig.stopped")
-            if motions:
-                self.table.start(motions)
+            if not motions:
+                return
+            began_s = float(self.clock.to_daq(np.array([self.table.start(motions)]))[0])
+        for motion in motions:
+            shaft = self._shafts[motion.axis]
+            shaft.from_deg = shaft.commanded_deg(began_s)
+            shaft.motion, shaft.started_s = motion, began_s
+            shaft.low_V, shaft.high_V = np.inf, -np.inf
 
     def waiting(self) -> Iterator[Block]:
         """Rows that came while nobody read: to be had before the next motion starts, or its segment would be late."""

@@ -31,12 +31,13 @@ class TwinTable:
         for axis in self.silent:
             raise DeviceError("rig.servo_silent", axis=axis, part=self.axes[axis].part)
 
-    def start(self, motions: Sequence[Motion]) -> None:
+    def start(self, motions: Sequence[Motion]) -> float:
         with self.lock:
             now_s = self.plant.now_s
             for motion in motions:
                 servo = self.plant.servos[motion.axis]
                 servo.command((now_s + t, *streaming.goal(motion, t)) for t in streaming.times(motion))
+            return self.plant.host_time_s
 
     def read(self) -> dict[str, Readings]:
         with self.lock:
