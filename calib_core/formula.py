@@ -233,7 +233,7 @@ def effect_of(name: str, formula: str, parameter: str, unit: str, acts: str = "o
     members = {
         "__doc__": card, "name": name, "acts": where, "stage": stage, "formula": read, "unit": unit,
         "needs": tuple(n for n in read.names if n in OPTIONAL),
-        parameter: Param(unit, 1.0, (-1e12, 1e12)),
+        parameter: Param(unit, 1.0, (-1e12, 1e12), code=read.text),
     }  # fmt: skip
     return type("".join(word.capitalize() for word in name.split("_")), (UserEffect,), members)
 

@@ -43,6 +43,9 @@ class Param:
     log: bool = False
     discrete: bool = False
     """Whether only the values of the grid have a meaning (how many terms of a series)."""
+    code: str = ""
+    """What ``columns`` gives for a linear parameter, as a formula for exported compensation: over covariates,
+    ``warmth``, ``reference_supply_v``, ``<a>_acceleration_g``, the nonlinear parameters, and ``lagged(value, tau)``."""
 
 
 @dataclass

@@ -15,7 +15,7 @@ class BiasDrift(Effect):
     """
 
     name, stage, acts, needs = "bias_drift", Stage.ELECTRICS, Acts.OUTPUT, ()
-    r = Param("{out}/s", 8e-6, (-1e-2, 1e-2))
+    r = Param("{out}/s", 8e-6, (-1e-2, 1e-2), code="time_s")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

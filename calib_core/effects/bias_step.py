@@ -15,7 +15,7 @@ class BiasStep(Effect):
     """
 
     name, stage, acts, needs = "bias_step", Stage.ELECTRICS, Acts.OUTPUT, ()
-    a = Param("{out}", 1.2e-3, (-0.5, 0.5))
+    a = Param("{out}", 1.2e-3, (-0.5, 0.5), code="where(time_s > t1, 1, 0)")
     t1 = Param("s", 100.0, (0.0, 1e6), grid=(100.0,))
 
     @classmethod

@@ -15,9 +15,9 @@ class BiasTemperature(Effect):
     """
 
     name, stage, acts, needs = "bias_temperature", Stage.ELECTRICS, Acts.OUTPUT, ("temperature_c",)
-    k1 = Param("{out}/degC", 2e-4, (-1e-2, 1e-2))
-    k2 = Param("{out}/degC^2", 5e-6, (-1e-3, 1e-3))
-    k3 = Param("{out}/degC^3", 1e-7, (-1e-4, 1e-4))
+    k1 = Param("{out}/degC", 2e-4, (-1e-2, 1e-2), code="warmth")
+    k2 = Param("{out}/degC^2", 5e-6, (-1e-3, 1e-3), code="warmth**2")
+    k3 = Param("{out}/degC^3", 1e-7, (-1e-4, 1e-4), code="warmth**3")
 
     degree = Param("1", 1.0, (1.0, 3.0), grid=(1.0, 2.0, 3.0), discrete=True)
 

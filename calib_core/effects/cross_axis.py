@@ -15,7 +15,7 @@ class CrossAxis(Effect):
     """
 
     name, stage, acts, needs = "cross_axis", Stage.TABLE, Acts.RATE, ("other_rate_dps",)
-    k = Param("1", 8e-3, (-0.5, 0.5))
+    k = Param("1", 8e-3, (-0.5, 0.5), code="other_rate_dps")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

@@ -17,11 +17,11 @@ class GSensitivity(Effect):
     """
 
     name, stage, acts = "g_sensitivity", Stage.SENSOR, Acts.OUTPUT
-    k_s = Param("{out}", 8e-4, (-0.1, 0.1))
-    k_c = Param("{out}", 8e-4, (-0.1, 0.1))
-    k_x = Param("{out}/g", 8e-4, (-0.1, 0.1))
-    k_y = Param("{out}/g", 8e-4, (-0.1, 0.1))
-    k_z = Param("{out}/g", 8e-4, (-0.1, 0.1))
+    k_s = Param("{out}", 8e-4, (-0.1, 0.1), code="sin(radians(tilt_deg))")
+    k_c = Param("{out}", 8e-4, (-0.1, 0.1), code="cos(radians(tilt_deg)) - 1")
+    k_x = Param("{out}/g", 8e-4, (-0.1, 0.1), code="x_acceleration_g")
+    k_y = Param("{out}/g", 8e-4, (-0.1, 0.1), code="y_acceleration_g")
+    k_z = Param("{out}/g", 8e-4, (-0.1, 0.1), code="z_acceleration_g")
 
     @classmethod
     def missing(cls, c: Covariates) -> bool:

@@ -17,11 +17,11 @@ class GSquaredSensitivity(Effect):
     """
 
     name, stage, acts = "g_squared_sensitivity", Stage.SENSOR, Acts.OUTPUT
-    k_s = Param("{out}", 4e-4, (-0.1, 0.1))
-    k_c = Param("{out}", 4e-4, (-0.1, 0.1))
-    k_xx = Param("{out}/g^2", 4e-4, (-0.1, 0.1))
-    k_yy = Param("{out}/g^2", 4e-4, (-0.1, 0.1))
-    k_zz = Param("{out}/g^2", 4e-4, (-0.1, 0.1))
+    k_s = Param("{out}", 4e-4, (-0.1, 0.1), code="sin(radians(2 * tilt_deg))")
+    k_c = Param("{out}", 4e-4, (-0.1, 0.1), code="cos(radians(2 * tilt_deg)) - 1")
+    k_xx = Param("{out}/g^2", 4e-4, (-0.1, 0.1), code="x_acceleration_g**2")
+    k_yy = Param("{out}/g^2", 4e-4, (-0.1, 0.1), code="y_acceleration_g**2")
+    k_zz = Param("{out}/g^2", 4e-4, (-0.1, 0.1), code="z_acceleration_g**2")
 
     @classmethod
     def missing(cls, c: Covariates) -> bool:

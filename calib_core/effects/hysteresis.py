@@ -17,7 +17,7 @@ class Hysteresis(Effect):
     """
 
     name, stage, acts, needs = "hysteresis", Stage.SENSOR, Acts.OUTPUT, ()
-    h = Param("{out}", 6e-4, (-0.1, 0.1))
+    h = Param("{out}", 6e-4, (-0.1, 0.1), code="where(direction == 0, start, direction)")
 
     start = Param("1", 0.0, (-1.0, 1.0), grid=(-1.0, 0.0, 1.0))  # the sign before the first rotation
 

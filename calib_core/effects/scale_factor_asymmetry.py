@@ -17,7 +17,7 @@ class ScaleFactorAsymmetry(Effect):
     """
 
     name, stage, acts, needs = "scale_factor_asymmetry", Stage.SENSOR, Acts.RATE, ()
-    k = Param("1", 4e-3, (-0.5, 0.5))
+    k = Param("1", 4e-3, (-0.5, 0.5), code="abs(rate_dps)")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

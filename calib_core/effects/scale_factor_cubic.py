@@ -15,7 +15,7 @@ class ScaleFactorCubic(Effect):
     """
 
     name, stage, acts, needs = "scale_factor_cubic", Stage.SENSOR, Acts.RATE, ()
-    k = Param("1/(deg/s)^2", 1.2e-6, (-1e-3, 1e-3))
+    k = Param("1/(deg/s)^2", 1.2e-6, (-1e-3, 1e-3), code="rate_dps**3")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

@@ -15,7 +15,7 @@ class ScaleFactorQuadratic(Effect):
     """
 
     name, stage, acts, needs = "scale_factor_quadratic", Stage.SENSOR, Acts.RATE, ()
-    k = Param("1/(deg/s)", 6e-5, (-0.01, 0.01))
+    k = Param("1/(deg/s)", 6e-5, (-0.01, 0.01), code="rate_dps**2")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

@@ -15,7 +15,7 @@ class ScaleFactorTemperature(Effect):
     """
 
     name, stage, acts, needs = "scale_factor_temperature", Stage.SENSOR, Acts.RATE, ("temperature_c",)
-    k = Param("1/degC", 8e-4, (-0.05, 0.05))
+    k = Param("1/degC", 8e-4, (-0.05, 0.05), code="warmth * rate_dps")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

@@ -15,7 +15,7 @@ class SupplySensitivity(Effect):
     """
 
     name, stage, acts, needs = "supply_sensitivity", Stage.ELECTRICS, Acts.OUTPUT, ("supply_v",)
-    k = Param("{out}/V", 0.04, (-10.0, 10.0))
+    k = Param("{out}/V", 0.04, (-10.0, 10.0), code="supply_v - reference_supply_v")
 
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:

@@ -15,7 +15,7 @@ class ThermalLag(Effect):
     """
 
     name, stage, acts, needs = "thermal_lag", Stage.ELECTRICS, Acts.OUTPUT, ("temperature_c",)
-    k = Param("{out}/degC", 4e-4, (-1e-2, 1e-2))
+    k = Param("{out}/degC", 4e-4, (-1e-2, 1e-2), code="lagged(warmth, tau)")
     tau = Param("s", 25.0, (2.0, 3000.0), grid=(6.0, 12.0, 24.0, 48.0, 96.0, 200.0, 500.0), log=True)
 
     @classmethod

@@ -17,7 +17,7 @@ class WarmUp(Effect):
     """
 
     name, stage, acts, needs = "warm_up", Stage.ELECTRICS, Acts.OUTPUT, ()
-    a = Param("{out}", 4.5e-3, (-0.5, 0.5))
+    a = Param("{out}", 4.5e-3, (-0.5, 0.5), code="exp(-time_s / tau)")
     tau = Param("s", 40.0, (3.0, 2000.0), grid=(8.0, 16.0, 32.0, 64.0, 128.0, 256.0), log=True)
 
     @classmethod
