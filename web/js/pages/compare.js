@@ -53,7 +53,7 @@ function tables(first, second) {
   const columns = [first, second].flatMap((c) => ["x", "z"].map((axis) => figures(c.axes[axis] ?? {})));
   const part = (key, isIn) => h("section", { class: "panel stack" }, h("h2", {}, t(`compare.${key}`)), table(head,
     columns[0].map((figure, i) => ({ figure, i })).filter(({ figure }) => isIn(figure.path[0]))
-      .map(({ figure, i }) => [`${figure.name}, ${figure.unit}`, ...columns.map((column) => ({ n: column[i].text }))]), { label: t(`compare.${key}`) }));
+      .map(({ figure, i }) => [`${figure.name}, ${figure.unit}`, ...columns.map((column) => ({ n: column[i].text }))]), { cards: true, label: t(`compare.${key}`) }));
   return [
     h("p", { class: "muted" }, [first, second].map((c) => t("compare.from", { board: c.board, number: c.number, date: when(c.issued_at) })).join(" · ")),
     part("parameters", (key) => key !== "rate" && key !== "position"),

@@ -53,7 +53,7 @@ page("rig", async (main) => {
     told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder }) : t("rig.no_lease");
     limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
       table(["", { n: `${t("rig.from")}, deg` }, { n: `${t("rig.to")}, deg` }, { n: `${t("rig.top_speed")}, deg/s` }],
-        Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: plain(a.min_deg) }, { n: plain(a.max_deg) }, { n: fixed(a.max_rate_dps, 0) }]), { compact: true, label: t("rig.limits") }));
+        Object.entries(rig.axes ?? {}).map(([axis, a]) => [axis, { n: plain(a.min_deg) }, { n: plain(a.max_deg) }, { n: fixed(a.max_rate_dps, 0) }]), { cards: true, label: t("rig.limits") }));
   });
 
   const { items } = await api.gyroModels();
