@@ -171,11 +171,12 @@ def menu(axis: str, rig: Mapping[str, Axis], sensor_dps: Mapping[str, float], *,
     slow = tuple(min(rate, top) for rate in (4.0, 9.0, 19.0))
     offered += [
         [waves("multisine", fast, (0.34, 0.33, 0.33), 100.0, axis)],
-        [waves("multisine", fast, (0.1, 0.15, 0.75), 100.0, axis)],
+        [waves("multisine", fast, (0.05, 0.1, 0.85), 100.0, axis)],
         [waves("sine", (0.2513,), (1.0,), 99.5, axis)],
         [waves("multisine", (0.1037, 0.7193), (0.3, 0.1), 100.0, axis)],
         [Excitation(axis, "sine", 98.5, amplitude_deg=(reach,), frequency_hz=(0.0203,))],
         [Excitation(axis, "staircase", 100.0, rates_dps=rates)],
+        [Excitation(axis, "staircase", 100.0, rates_dps=rates[2:])],
         [Excitation(axis, "staircase", 100.0, rates_dps=slow)],
         [Excitation(axis, "poses", 100.0, angles_deg=poses)],
         [Excitation(axis, "hold", 100.0)],

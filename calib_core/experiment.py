@@ -10,85 +10,102 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_core import gap_unknown
-from calib_core.effects import Effect
-from calib_core.effects.base import Acts
-from calib_core.effects.saturation import Saturation
+from calib_core.contest import Columns, Contest, sizes_in, values_of
+from calib_core.effects import Acts, Effect
 from calib_core.excitation import Excitation, menu
 from calib_core.gap import BY_ITSELF, Diagnosis
-from calib_core.gap_search import settings
 from calib_core.gap_space import Space, Term
 from calib_core.gyro_models import PRESETS, GyroModel
-from calib_core.prospect import Hand, clipping, imagine
+from calib_core.problem import Problem
+from calib_core.prospect import PAUSE_S, Hand, imagine
 from calib_core.recording import Recording
 from calib_core.sequence import Axis
 
 F64 = NDArray[np.float64]
 
-DECIDES = 35.0
-"""2ΔlnL to expect for a decision in 99 of 100 tries: it scatters by twice its root, and 6 must be passed."""
+DECIDES = 50.0
+"""2ΔlnL to expect for a decision in 99 of 100 tries: it scatters by twice its root, 6 must be passed, and the codes of
+strokes that begin alike are worth some 5 either way."""
 RIG: Mapping[str, Axis] = {
     axis: Axis(axis, -150.0, 150.0, rate, 300.0 / 1023.0, part, 12.1)
     for axis, rate, part in (("x", 326.0, "RX-28"), ("z", 254.0, "RX-64"))
 }
 """The bench of HARDWARE, where no rig was chosen."""
-LONGER = 3.0
+LONGER = 4.0
 """A motion that brings too little may last so many times longer."""
-NEARLY = 0.6
-"""Of the most that a motion brings; what takes less time and brings this much is preferred."""
-CLIPS = 16
-"""Clip levels tried, from half of the fastest rate on."""
-
+NEARLY, PLENTY = 0.6, 2.0
+"""What brings this share of the most, or this many times what decides, is as good where it takes less."""
 Motions = tuple[Excitation, ...]
-Setting = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Proposal:
-    """What to do next, and what it would bring."""
+class Offer:
+    """A motion, and the 2ΔlnL to expect of it, with the data in hand, for each question asked."""
 
-    separates: tuple[str, ...]
     motion: Motions
-    expected: float
-    """Smallest 2ΔlnL to expect over the pairs, with the data in hand."""
-    in_hand: float
-    """The same from the data in hand alone."""
-    kind: str = "rivals"
-    """``rivals``, ``unknown`` or ``not_excited``."""
-    offered: tuple[tuple[Motions, float], ...] = field(default=(), repr=False)
-    """Every motion of the menu with what it would bring."""
+    evidence: tuple[float, ...]
 
     @property
     def duration_s(self) -> float:
         return sum(e.duration_s for e in self.motion)
 
     @property
+    def settled(self) -> tuple[int, ...]:
+        """The questions that it would decide."""
+        return tuple(k for k, value in enumerate(self.evidence) if value >= DECIDES)
+
+    @property
+    def expected(self) -> float:
+        """The smallest evidence of a question that it would decide; where it would none, the one it comes nearest."""
+        return min((self.evidence[k] for k in self.settled), default=max(self.evidence))
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to do next, and what it would bring."""
+
+    kind: str
+    """``rivals``, ``unknown`` or ``not_excited``."""
+    separates: tuple[str, ...]
+    offer: Offer
+    in_hand: float
+    """The smallest evidence for a question that the motion would decide, from the data in hand alone."""
+    remain: tuple[tuple[str, ...], ...] = ()
+    """Rivals that would still be tied."""
+    offered: tuple[Offer, ...] = field(default=(), repr=False)
+    """The whole menu."""
+
+    @property
+    def motion(self) -> Motions:
+        return self.offer.motion
+
+    @property
+    def expected(self) -> float:
+        return self.offer.expected
+
+    @property
     def decides(self) -> bool:
-        return self.expected >= DECIDES
+        return bool(self.offer.settled)
 
     def to_json(self) -> dict[str, Any]:
         """CONTRACT 3's ``next_experiment``; its sentence is rendered from code and values."""
         code = f"experiment.{self.kind}" if self.decides else "experiment.none_decides"
-        values = {
-            "effects": list(self.separates),
-            "kinds": [e.kind for e in self.motion],
-            "duration_s": self.duration_s,
-            "expected": self.expected,
-            "needed": DECIDES,
-        }
+        values = {"duration_s": self.offer.duration_s, "expected": self.expected, "needed": DECIDES}
         return {
             "separates": list(self.separates),
             "motion": [e.to_json() for e in self.motion],
-            "duration_s": self.duration_s,
+            "duration_s": self.offer.duration_s,
             "expected_two_delta_lnL": self.expected,
             "in_hand_two_delta_lnL": self.in_hand,
             "decides": self.decides,
+            "remain": [list(names) for names in self.remain],
             "code": code,
             "values": values,
         }
@@ -121,22 +138,29 @@ def propose(
 def separate(
     hand: Hand, rivals: Sequence[Term], rig: Mapping[str, Axis] = RIG, sensor: Mapping[str, float] | None = None
 ) -> Proposal:
-    """The motion that tells ``rivals`` apart, each taken for the truth in turn, at the size it has in hand."""
+    """The motion that tells most of ``rivals`` apart, each taken for the truth in turn at the size it has in hand.
+
+    Some pairs no motion may tell apart (a warm-up slow enough is a drift): they are named in ``remain``.
+    """
     contest = Contest(hand, [(t.effect, t.setting, sizes_in(hand, t)) for t in rivals], [t.effect for t in rivals])
-    pairs = list(permutations(range(len(rivals)), 2))
+    pairs = list(combinations(range(len(rivals)), 2))
 
-    def worst(columns: Columns) -> float:
-        return min(contest.left(columns, i, j) for i, j in pairs)
+    def evidence(columns: Columns) -> tuple[float, ...]:
+        return tuple(min(contest.left(columns, i, j), contest.left(columns, j, i)) for i, j in pairs)
 
-    offered = tuple((motion, worst(columns)) for motion, columns in contest.played(rig, sensor))
-    in_hand = worst(contest.in_hand)
-    motion, expected = _cheapest(offered)
-    more = (DECIDES - in_hand) / max(expected - in_hand, 1e-9)
-    if 1.0 < more <= LONGER:
-        motion = tuple(replace(e, duration_s=round(1.1 * more * e.duration_s, 1)) for e in motion)
-        expected = worst(contest.after(motion))
-        offered = (*offered, (motion, expected))
-    return Proposal(tuple(t.name for t in rivals), motion, expected, in_hand, "rivals", offered)
+    offered = [Offer(motion, evidence(columns)) for motion, columns in _played(contest, rig, sensor)]
+    before = evidence(contest.in_hand)
+    best = _cheapest(offered)
+    missing = [(DECIDES - h) / (e - h) for h, e in zip(before, best.evidence, strict=True) if h < e < DECIDES]
+    more = [factor for factor in missing if factor < LONGER]
+    if more:
+        longer = tuple(replace(e, duration_s=round(1.1 * max(more) * e.duration_s, 1)) for e in best.motion)
+        best = Offer(longer, evidence(contest.after(longer)))
+        offered.append(best)
+    names = tuple(t.name for t in rivals)
+    tied = [(names[i], names[j]) for k, (i, j) in enumerate(pairs) if k not in best.settled]
+    in_hand = min(before[k] for k in best.settled or range(len(pairs)))
+    return Proposal("rivals", names, best, in_hand, _groups(names, tied), tuple(offered))
 
 
 def excite(
@@ -159,19 +183,15 @@ def excite(
     if not truths:
         return None
     contest = Contest(hand, truths, [])
-    found: Proposal | None = None
-    best, offered = (-1, 0.0), []
-    for motion, columns in contest.played(rig, sensor):
-        brings = {truths[i][0].name: contest.left(columns, i) for i in range(len(truths))}
-        seen = sorted((name for name in brings if brings[name] >= DECIDES), key=lambda n: -brings[n])
-        seen = seen or [max(brings, key=lambda n: brings[n])]
-        least = brings[seen[-1]]
-        offered.append((motion, least))
-        shown = len(seen) if least >= DECIDES else 0  # more suspects before stronger evidence
-        if (shown, least) > best:
-            best = (shown, least)
-            found = Proposal(tuple(seen), motion, least, 0.0, "not_excited")
-    return found
+
+    def evidence(columns: Columns) -> tuple[float, ...]:
+        return tuple(contest.left(columns, i) for i in range(len(truths)))
+
+    offered = [Offer(motion, evidence(columns)) for motion, columns in _played(contest, rig, sensor)]
+    best, before = _cheapest(offered), evidence(contest.in_hand)
+    shown = best.settled or (int(np.argmax(best.evidence)),)
+    names = tuple(truths[k][0].name for k in shown)
+    return Proposal("not_excited", names, best, min(before[k] for k in shown), offered=tuple(offered))
 
 
 def explore(
@@ -181,117 +201,47 @@ def explore(
     sensor: Mapping[str, float] | None = None,
 ) -> Proposal:
     """The motion that would show most of a structure without a name: its evidence grows as its covariate is visited."""
-    known, values = _visited(hand.space, unknown.covariate), _values(hand)
-    offered = tuple(
-        (motion, unknown.gain * (1.0 + _visited(imagine(hand, motion, values), unknown.covariate) / max(known, 1e-300)))
-        for motion in _motions(hand, rig, sensor)
-    )
-    motion, expected = _cheapest(offered)
-    return Proposal((unknown.covariate,), motion, expected, unknown.gain, "unknown", offered)
+    known, values = _visited(hand.space, unknown.covariate), values_of(hand)
+    offered = []
+    for motion in _motions(hand, rig, sensor):
+        more = _visited(imagine(hand, motion, values), unknown.covariate) / max(known, 1e-300)
+        offered.append(Offer(motion, (unknown.gain * (1.0 + more),)))
+    best = max(offered, key=lambda offer: offer.expected)
+    return Proposal("unknown", (unknown.covariate,), best, unknown.gain, offered=tuple(offered))
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Whitened columns as the R of their QR: lengths and angles are all that is asked of them."""
+def join(hand: Recording, run: Recording, axis: str, after_s: float = PAUSE_S) -> Recording:
+    """The data in hand and an experiment's as one record of one board in one session, ``after_s`` between them.
 
-    r: F64
-
-    @classmethod
-    def of(cls, white: F64) -> Columns:
-        """Of whitened columns (n, p), n ≥ p or not."""
-        return cls(np.asarray(np.linalg.qr(white, mode="r")))
-
-    def on_top_of(self, other: Columns) -> Columns:
-        """Both records together."""
-        return Columns.of(np.vstack([other.r, self.r]))
-
-    def unexplained(self, signal: int, held: Sequence[int], less: int | None = None) -> float:
-        """The square of column ``signal`` (less another one) that the columns ``held`` cannot explain."""
-        target = self.r[:, signal] - (0.0 if less is None else self.r[:, less])
-        known = self.r[:, held]
-        size = np.linalg.norm(known, axis=0)
-        known = known[:, size > 0.0] / size[size > 0.0]
-        rest = target - known @ np.linalg.lstsq(known, target, rcond=1e-10)[0]
-        return float(rest @ rest)
+    Raises Problem where they cannot be: another board, another unit, or samples that were taken in another way.
+    """
+    told = {
+        "board": (hand.header.get("board", ""), run.header.get("board", "")),
+        "unit": (hand.gyro(axis).unit, run.gyro(axis).unit),
+        "gyro_average_s": (hand.header.get("gyro_average_s", "0"), run.header.get("gyro_average_s", "0")),
+        f"{axis}_gyro_delay_s": tuple(r.header.get(f"{axis}_gyro_delay_s", "0") for r in (hand, run)),
+    }
+    for name, (before, now) in told.items():
+        if before != now and not (name == "board" and "" in (before, now)):
+            raise Problem("experiment.other_record", name=name, before=before, now=now)
+    shift = hand.time_s[-1] + after_s - run.time_s[0]
+    columns = {n: np.round(v + shift, 6) if n.endswith("time_s") else v for n, v in run.columns.items()}
+    return Recording.join([hand, replace(run, time_s=np.round(run.time_s + shift, 6), columns=columns)])
 
 
-class Contest:
-    """Signals of ``truths`` (effect, setting, sizes), and the columns with which ``fits`` would try to explain them."""
-
-    def __init__(
-        self, hand: Hand, truths: Sequence[tuple[type[Effect], Setting, F64]], fits: Sequence[type[Effect]]
-    ) -> None:
-        self.hand, self.truths = hand, truths
-        self.values = _values(hand)
-        self.fits = [[(e, s) for s in _tries(hand, e, [t[1] for t in truths if t[0] is e])] for e in fits]
-        self._places: list[list[list[int]]] = []
-        self._held: list[int] = []
-        self.in_hand = self._columns(hand.space)
-
-    def played(self, rig: Mapping[str, Axis], sensor: Mapping[str, float] | None) -> Iterator[tuple[Motions, Columns]]:
-        """Each motion of the menu with the columns of both records."""
-        for motion in _motions(self.hand, rig, sensor):
-            yield motion, self.after(motion)
-
-    def after(self, motion: Motions) -> Columns:
-        """The columns of both records, once ``motion`` has been done."""
-        return self._columns(imagine(self.hand, motion, self.values)).on_top_of(self.in_hand)
-
-    def left(self, columns: Columns, truth: int, fit: int | None = None) -> float:
-        """2ΔlnL to expect of ``truth`` over base and ``fit``, at whatever setting that does best."""
-        if fit is None:
-            return columns.unexplained(truth, self._held)
-        if self.fits[fit][0][0] is Saturation:
-            return min(columns.unexplained(truth, self._held, less=place[0]) for place in self._places[fit])
-        return min(columns.unexplained(truth, [*self._held, *place]) for place in self._places[fit])
-
-    def _columns(self, space: Space) -> Columns:
-        """[signals, base, kept, fits at every setting], whitened."""
-        found = [_term(space, effect, setting).columns @ sizes for effect, setting, sizes in self.truths]
-        base = np.zeros((len(space.base), len(self.values)))
-        base[:, : space.base.shape[1]] = space.base
-        parts = [np.column_stack(found), base, *(_term(space, t.effect, t.setting).columns for t in self.hand.kept)]
-        width = sum(p.shape[1] for p in parts)
-        self._held = list(range(len(found), width))
-        self._places = []
-        for tries in self.fits:
-            places = []
-            for effect, setting in tries:
-                columns = _term(space, effect, setting).columns
-                places.append(list(range(width, width + columns.shape[1])))
-                width += columns.shape[1]
-                parts.append(columns)
-            self._places.append(places)
-        return Columns.of(space.whitener.whiten(np.column_stack(parts)))
-
-
-def sizes_in(hand: Hand, term: Term) -> F64:
-    """(p,) the coefficients of ``term`` in the data in hand, beside base and what is kept."""
-    if term.fixed:
-        return np.ones(1)
-    gram = hand.space.gram([*hand.kept, term])
-    free = list(range(1 + gram.base, gram.matrix.shape[0]))
-    return gram.coefficients(free)[0][-len(term.names) :]
+def model_of(recording: Recording) -> GyroModel | None:
+    """The gyro model that the recording's header carries."""
+    text = recording.header.get("gyro_model", "")
+    try:
+        return GyroModel.from_json(json.loads(text)) if text else None
+    except ValueError:
+        return None
 
 
 def ranges(recording: Recording, gyro_model: GyroModel | None = None) -> dict[str, float]:
     """Up to what rate (deg/s) each axis of the sensor may be turned, by its datasheet."""
-    if gyro_model is None and "gyro_model" in recording.header:
-        gyro_model = GyroModel.from_json(json.loads(recording.header["gyro_model"]))
-    gyro_model = gyro_model or PRESETS["LPY503AL-OUT"]
+    gyro_model = gyro_model or model_of(recording) or PRESETS["LPY503AL-OUT"]
     return {axis: sheet.range_dps for axis, sheet in gyro_model.axes.items()}
-
-
-def _tries(hand: Hand, effect: type[Effect], own: Sequence[Setting]) -> list[Setting]:
-    """The settings at which ``effect`` may explain another's signal: its grid, and where it stands already."""
-    if effect is Saturation:
-        c, values = hand.space.covariates, _values(hand)
-        top = float(np.abs(c.rate_dps).max())
-        limits = [values[0] + abs(values[1]) * top * part for part in np.linspace(0.5, 1.5, CLIPS)]
-        return [*own, *((2.0 * values[0] - limit, limit) for limit in limits)]
-    if effect.curvature is not None or not effect.nonlinear():
-        return list(own) or [()]
-    return [*own, *settings(effect, hand.space)]
 
 
 def _motions(hand: Hand, rig: Mapping[str, Axis], sensor: Mapping[str, float] | None) -> list[Motions]:
@@ -299,25 +249,30 @@ def _motions(hand: Hand, rig: Mapping[str, Axis], sensor: Mapping[str, float] | 
     return [tuple(m) for m in menu(hand.axis, rig, sensor or ranges(hand.recording), heat=heat)]
 
 
-def _cheapest(offered: Sequence[tuple[Motions, float]]) -> tuple[Motions, float]:
-    """Of the motions that bring nearly the most, the one that takes least: in hands, then in time."""
-    most = max(expected for _, expected in offered)
-    good = [offer for offer in offered if offer[1] >= NEARLY * most]
-    return min(good, key=lambda offer: (len(offer[0]), sum(e.duration_s for e in offer[0]), -offer[1]))
+def _played(
+    contest: Contest, rig: Mapping[str, Axis], sensor: Mapping[str, float] | None
+) -> Iterator[tuple[Motions, Columns]]:
+    """Each motion of the menu with the columns of both records."""
+    for motion in _motions(contest.hand, rig, sensor):
+        yield motion, contest.after(motion)
 
 
-def _values(hand: Hand) -> F64:
-    """(2,) bias and scale factor; the datasheet's where nothing has moved yet."""
-    values = hand.space.values
-    if len(values) > 1:
-        return values
-    unit = hand.space.design.averages.samples.unit
-    sheet = PRESETS["LPY503AL-OUT"].axes["x"].scale_factor_V_per_dps
-    return np.array([values[0], sheet if unit == "V" else 1.0])
+def _cheapest(offered: Sequence[Offer]) -> Offer:
+    """Of the motions that decide most and bring nearly the most, or plenty, the one that takes least."""
+    most = max(len(offer.settled) for offer in offered)
+    good = [offer for offer in offered if len(offer.settled) == most]
+    enough = min(NEARLY * max(offer.expected for offer in good), PLENTY * DECIDES)
+    good = [offer for offer in good if offer.expected >= enough]
+    return min(good, key=lambda offer: (len(offer.motion), round(offer.duration_s, -1), -offer.expected))
 
 
-def _term(space: Space, effect: type[Effect], setting: Setting) -> Term:
-    return clipping(space, setting) if effect is Saturation else space.term(effect, setting)
+def _groups(names: Sequence[str], tied: Sequence[tuple[str, str]]) -> tuple[tuple[str, ...], ...]:
+    """The names that hang together by ``tied`` pairs, two or more of them."""
+    groups = [{name} for name in names]
+    for pair in tied:
+        joined = set().union(*(g for g in groups if g & set(pair)))
+        groups = [g for g in groups if not g & joined] + [joined]
+    return tuple(tuple(name for name in names if name in g) for g in groups if len(g) > 1)
 
 
 def _visited(space: Space, covariate: str) -> float:

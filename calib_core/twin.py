@@ -85,6 +85,7 @@ class Plant:
         self.tilt, self.covariates = tilt, covariates
         self.now_s = 0.0
         self._polls = 0
+        self.warming_degC_per_s = 0.0  # of the room, beside its slow way to 26 °C
         self._heater = (0.0, 0.0, 0.0)  # since when, how warm then (°C above the room), to where
         self.mount(models or board_truth(seed))
 
@@ -99,6 +100,11 @@ class Plant:
             if any(effect.acts is Acts.ANGLE for effect in model.effects)
         }
         self._feels = any(effect.needs for model in self.models.values() for effect in model.effects)
+
+    def wait(self, until_s: float) -> None:
+        """Nothing is asked of the rig until it has been on for so long; what is queued goes on."""
+        self.now_s = max(self.now_s, until_s)
+        self._polls = max(self._polls, int(self.now_s / POLL_S))
 
     def heat(self, on: bool) -> None:
         """Blow warm air at the board, or leave it to the room, from now on."""
@@ -135,7 +141,8 @@ class Plant:
 
     def _surroundings(self, true_s: F64) -> tuple[F64, F64]:
         """Temperature (°C) and supply (V) around the board: a bench that warms by a degree in half an hour."""
-        return 26.0 - np.exp(-true_s / 1800.0) + self._warmth(true_s), np.full(len(true_s), 3.0)
+        room = 26.0 - np.exp(-true_s / 1800.0) + self.warming_degC_per_s * true_s
+        return room + self._warmth(true_s), np.full(len(true_s), 3.0)
 
     def encoders(self) -> dict[str, tuple[F64, F64]]:
         """What the bus thread has read since the last call: per axis host times (m,) and angles (m,)."""

@@ -1,5 +1,6 @@
 """Rig addresses: `twin:`, `emulated:`, and the bench's `dynamixel:PORT?…` joined by `+` with `nidaq:…` (CONTRACT 2)."""
 
+import math
 from collections.abc import Iterable
 from urllib.parse import parse_qsl
 
@@ -80,11 +81,13 @@ def _emulated(url: str, rest: str) -> Rig:
 
 
 def _twin(url: str, rest: str) -> Rig:
-    options = _query(url, rest, ("seed", "covariates", "effects"))
+    options = _query(url, rest, ("seed", "covariates", "effects", "warming"))
     effects = parse(options.pop("effects", ""))
+    warming = _float("warming", options.pop("warming", "0"), 60.0)
     given = {name: _number(name, text) for name, text in options.items()}
     seed = given.get("seed", 1)
     plant = Plant(seed, with_effects(board_truth(seed), effects), covariates=bool(given.get("covariates", 0)))
+    plant.warming_degC_per_s = warming / 60.0
     table = TwinTable(plant)
 
     def mount(board: str, gyro_model: GyroModel) -> None:
@@ -92,7 +95,9 @@ def _twin(url: str, rest: str) -> Rig:
             plant.mount(with_effects(board_truth(seed, board, gyro_model), effects))
 
     one_way_s = plant.daq.spec.transfer_s + LATCH_S
-    return Rig(url, table, TwinDaq(table), simulated=True, mount=mount, heat=table.heat, one_way_s=one_way_s)
+    return Rig(
+        url, table, TwinDaq(table), simulated=True, mount=mount, heat=table.heat, later=table.later, one_way_s=one_way_s
+    )
 
 
 def _query(url: str, rest: str, known: Iterable[str]) -> dict[str, str]:
@@ -114,3 +119,13 @@ def _number(name: str, text: str, highest: int = 10**18 - 1) -> int:
     if not text.isascii() or not text.isdigit() or len(text) > 18 or int(text) > highest:
         raise Problem("rig.option", name=name, given=text, allowed=TWIN, highest=highest)
     return int(text)
+
+
+def _float(name: str, text: str, most: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not -most <= value <= most:
+        raise Problem("rig.option", name=name, given=text, allowed=TWIN, highest=most)
+    return value

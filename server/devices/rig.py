@@ -95,6 +95,7 @@ class Rig:
         mount: Callable[[str, GyroModel], None] | None = None,
         ended: Callable[[], None] | None = None,
         heat: Callable[[bool], None] | None = None,
+        later: Callable[[float], None] | None = None,
         one_way_s: float = 0.0,
     ) -> None:
         """`one_way_s`: how much earlier than they were the clocks alone make the encoders' readings seem, if known."""
@@ -102,7 +103,8 @@ class Rig:
         self.connected = False
         self.rehearsed: str | None = None  # the board that the table was last turned slowly with
         self._faults: dict[str, DeviceError] = {}
-        self._mount, self._ended, self._heat, self._one_way_s = mount, ended, heat, one_way_s
+        self._mount, self._ended, self._heat, self._later = mount, ended, heat, later
+        self._one_way_s = one_way_s
         self._begun, self._starting = False, Lock()
         self._forget()
 
@@ -187,6 +189,11 @@ class Rig:
         """Heat the board, or leave it to cool. On a rig without a heater that is for whoever stands there."""
         if self._heat is not None:
             self._heat(on)
+
+    def after(self, seconds: float) -> None:
+        """Let a simulated rig be on for at least so long, so that what it measures next comes after; others are."""
+        if self._later is not None:
+            self._later(seconds)
 
     def begin(self) -> None:
         """Start sampling at time zero, and see that every part answers before anything moves."""

@@ -49,6 +49,11 @@ class TwinTable:
         with self.lock:
             self.plant.heat(on)
 
+    def later(self, seconds: float) -> None:
+        """The plant has been on for at least so long."""
+        with self.lock:
+            self.plant.wait(seconds)
+
     def telemetry(self) -> dict[str, Telemetry]:
         return {
             axis: Telemetry(servo.spec.supply_V, 34.0, 0.0, servo.torque_on)
