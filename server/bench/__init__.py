@@ -14,6 +14,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "core": ("core", "boards", "parsing", "calibration", "startup"),
     "bus": ("bus_daq",),
     "coverage": ("coverage",),
+    "gap": ("gap", "gap_real", "gap_cost", "gap_peers"),
 }
 
 

@@ -64,7 +64,7 @@ class _Path:
         self.add("hold", np.zeros(round(seconds * FINE_HZ)))
 
     def go(self, degrees: float, rate: float) -> None:
-        count = round(abs(degrees) / rate * FINE_HZ)
+        count = max(1, round(abs(degrees) / rate * FINE_HZ))
         self.add(f"rate:{np.sign(degrees) * rate:+g}", np.full(count, degrees * FINE_HZ / count))
 
     def wave(self, amplitudes: list[float], frequencies: list[float], seconds: float, *, other: bool = False) -> None:

@@ -1,0 +1,104 @@
+"""Real recordings: what is named on one part of the data, and how well that predicts the part not seen (METHOD 4)."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core import covariates
+from calib_core.effects import Acts, Chain, Effect, Stage, library
+from calib_core.gap import Diagnosis, diagnose
+from calib_core.gap_report import parameters
+from calib_core.integral_fit import Design
+from calib_core.recording import Recording, read
+from server.bench import Row
+
+F64 = NDArray[np.float64]
+
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "real"
+TURNED_S = 3129.7
+"""The temperature maximum of thermal_chamber: what follows is its last leg."""
+THERMAL = {"y": (1.541, 0.045), "x": (float("nan"), 0.163), "z": (float("nan"), 0.064)}
+FAST = {"x": (28.6, 7.3), "y": (14.4, 4.8), "z": (25.5, 4.2)}
+"""METHOD 4's error of the base and of its best model on the data not seen, deg/s."""
+
+
+def run(*, quick: bool) -> Iterator[Row]:
+    """Errors on the unseen part beside METHOD's, and its traps."""
+    if not FOLDER.is_dir():
+        yield Row("real recordings", float("nan"), "", ours="../shared/real is not here")
+        return
+    thermal = _read("thermal_chamber")
+    early = thermal.time_s <= TURNED_S
+    for axis, (_, best) in list(THERMAL.items())[: 1 if quick else None]:
+        yield from _rows(f"thermal_chamber {axis}, last leg", axis, thermal.take(early), thermal, ~early, best)
+    if quick:
+        return
+    one, other = _read("fast_rotation_A"), _read("fast_rotation_B")
+    for axis, (_, best) in FAST.items():
+        found = yield from _rows(f"fast_rotation {axis}, A → B", axis, one, other, np.ones(len(other), bool), best)
+        trapped = found.isdisjoint({"time_offset", "bandwidth_lag"})
+        yield Row(f"fast_rotation {axis}: the delay is missed", float(trapped), "1", 0.0)
+
+
+def _read(name: str) -> Recording:
+    with (FOLDER / f"{name}.csv").open("rb") as opened:
+        return read(opened, name=name)
+
+
+def _rows(name: str, axis: str, seen: Recording, whole: Recording, unseen: Any, best: float) -> Any:
+    """The error on the ``unseen`` rows of ``whole`` with what ``seen`` made us name; gives the names."""
+    said = diagnose(seen, axis)
+    assert said.after is not None
+    assert said.before is not None
+    plain = error(said, said.before, whole, axis, unseen)
+    after = error(said, said.after, whole, axis, unseen)
+    names = [term.name for term in said.after.terms]
+    told = f"{said.verdict}: {', '.join(names) or 'nothing'}; base {plain:.3g} deg/s"
+    yield Row(name, after, "deg/s", best, ours=told)
+    return set(names)
+
+
+def error(said: Diagnosis, explanation: Any, whole: Recording, axis: str, unseen: Any) -> float:
+    """RMS of the output less what the model predicts on the unseen rows, in deg/s."""
+    expected = predicted(said, explanation, whole, axis)
+    left = (whole.gyro(axis).values - expected)[unseen & whole.valid]
+    return float(np.sqrt(np.nanmean(left**2)))
+
+
+def predicted(said: Diagnosis, explanation: Any, whole: Recording, axis: str) -> F64:
+    """The output (n,) that the found model expects, forward through the signal chain."""
+    assert said.search is not None
+    values = {p["name"]: p["value"] for p in parameters(explanation)}
+    bias = values["bias_dps"]
+    scale = values.get("scale_factor_dps_per_dps", 1.0)
+    design = Design.of(whole, axis)
+    index = design.averages.samples.index
+    c = replace(
+        covariates.of(whole, axis, design, bias, scale), reference=said.search.space.covariates.reference, memory={}
+    )
+    none = np.zeros(len(index))
+    chain = Chain(c, none.copy(), c.rate_dps.copy(), none.copy(), scale, np.random.default_rng(0))
+    effects = [_effect(library()[t.name], values) for t in explanation.terms]
+    late = [e for e in effects if e.name == "time_offset"]
+    acting = [e for e in effects if e not in late]
+    for effect in acting:
+        if effect.acts is Acts.RATE and effect.stage is not Stage.ACQUISITION:
+            effect.apply(chain)
+    chain.output = bias + scale * chain.rate_dps
+    for effect in acting:
+        if effect.acts is Acts.OUTPUT or effect.stage is Stage.ACQUISITION:
+            effect.apply(chain)
+    for effect in late:
+        chain.output = np.interp(c.time_s - effect.values["delay"], c.time_s, chain.output)
+    out = np.full(len(whole), np.nan)
+    out[index] = chain.output
+    return out
+
+
+def _effect(effect: type[Effect], values: dict[str, float]) -> Effect:
+    prefix = f"{effect.name}."
+    return effect(**{name.removeprefix(prefix): v for name, v in values.items() if name.startswith(prefix)})
