@@ -1,5 +1,6 @@
 """The other pages: language, phone width, lists, comparison, a run's own page."""
 
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,25 @@ def test_certificate_is_verified_from_its_list(window: Window) -> None:
     page = window.open("/certificates.html")
     page.locator("tbody button").first.click()
     page.wait_for_selector("output:has-text('same numbers')")
+
+
+def test_a_recording_from_a_file_is_certified_and_a_bad_one_is_explained(
+    browser: Any, server: Server, tmp_path: Path
+) -> None:
+    window = Window(browser, server)
+    page = window.open("/certificates.html")
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time_s,x_gyro_v\n0,1.2\n0.01,1.2\n0.005,1.2\n", encoding="utf-8")
+    page.set_input_files("#file", bad)
+    page.wait_for_selector(".error:has-text('Line 4, column time_s')")
+    number = server.call("GET", "/certificates?board=LPY-A")["items"][0]["number"]
+    recording = server.call("GET", f"/certificates/{number}")["recording"]["id"]
+    with urllib.request.urlopen(f"{server.url}/api/v1/recordings/{recording}.csv", timeout=30) as answer:
+        bad.write_bytes(answer.read())
+    page.set_input_files("#file", bad)
+    page.wait_for_selector("output a[href*='.pdf']")
+    assert not page.locator(".error").inner_text()
+    window.close(refusals=1)
 
 
 def test_two_boards_stand_side_by_side(window: Window) -> None:

@@ -104,6 +104,11 @@ export const api = {
   certificates: (q) => call("GET", `/certificates${query(q)}`),
   certificate: (number) => call("GET", `/certificates/${id(number)}`),
   certify: (body) => call("POST", "/certificates", body),
+  upload(file) {
+    const form = new FormData();
+    form.append("file", file);
+    return call("POST", "/recordings", form);
+  },
   verify: (number) => call("GET", `/certificates/${id(number)}/verify`),
 
   thesis: () => call("GET", "/thesis"),

@@ -1,14 +1,14 @@
 // Certificates: all of them, their documents, and whether their recordings still give the same numbers.
 
 import { api, links } from "../api.js";
-import { h } from "../dom.js";
+import { h, say } from "../dom.js";
 import { empty, list } from "../list.js";
 import { page } from "../shell.js";
 import { t, when } from "../text.js";
 
 page("certificates", async (main) => {
   const place = h("section", { class: "panel stack" });
-  main.append(h("h1", {}, t("page.certificates")), place);
+  main.append(h("h1", {}, t("page.certificates")), place, certifyCard());
   await list(place, {
     load: (q) => api.certificates({ ...q, limit: 50 }),
     label: t("page.certificates"),
@@ -19,6 +19,31 @@ page("certificates", async (main) => {
     empty: empty("certificates.empty", "/", "boards.first"),
   });
 });
+
+/** A recording from a file becomes a certificate, or a sentence that says what is wrong with it. */
+function certifyCard() {
+  const file = h("input", { id: "file", type: "file", accept: ".csv,.gz,.parquet" });
+  const error = h("p", { class: "error", role: "alert" });
+  const told = h("output", {});
+  file.addEventListener("change", async () => {
+    if (!file.files.length) return;
+    say(error, null);
+    told.textContent = t("certificates.certifying");
+    file.disabled = true;
+    try {
+      const recording = await api.upload(file.files[0]);
+      const { number } = await api.certify({ recording: recording.id });
+      told.replaceChildren(h("a", { href: links.document(number, "pdf"), download: "" }, t("certificates.certified", { number })));
+    } catch (problem) {
+      told.textContent = "";
+      say(error, problem);
+    }
+    file.disabled = false;
+    file.value = "";
+  });
+  return h("section", { class: "panel stack" }, h("h2", {}, t("certificates.from_file")),
+    h("div", {}, h("label", { for: "file" }, t("certificates.file")), file), error, told);
+}
 
 /** Computes the certificate again from its recording and says in one sentence what came of it. */
 function verifyButton(number) {
