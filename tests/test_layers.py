@@ -8,12 +8,23 @@ import pytest
 from shared import ROOT
 
 ALLOWED_IN_CORE = {
-    "numpy", "scipy", "filterpy", "pyarrow", "calib_core", "__future__", "collections", "dataclasses", "enum", "functools",
-    "itertools", "math", "typing", "types", "abc", "re", "json", "csv", "io", "gzip", "zlib", "hashlib", "struct", "importlib",
-    "contextlib", "bisect", "operator", "string", "statistics", "decimal", "fractions", "numbers", "copy", "pkgutil", "ast", "inspect",
-    "array",
+    "numpy", "scipy", "filterpy", "pyarrow", "calib_core", "__future__", "collections", "dataclasses", "enum",
+    "functools", "itertools", "math", "typing", "types", "abc", "re", "json", "csv", "io", "gzip", "zlib",
+    "hashlib", "struct", "importlib", "contextlib", "bisect", "operator", "string", "statistics", "decimal",
+    "fractions", "numbers", "copy", "pkgutil", "ast", "inspect", "array",
 }  # fmt: skip
-LAZY = {"scipy", "filterpy", "pyarrow", "typst", "dask", "distributed", "dynamixel_sdk", "nidaqmx", "grpc", "cryptography"}
+LAZY = {
+    "scipy",
+    "filterpy",
+    "pyarrow",
+    "typst",
+    "dask",
+    "distributed",
+    "dynamixel_sdk",
+    "nidaqmx",
+    "grpc",
+    "cryptography",
+}
 SOURCES = sorted([*ROOT.glob("calib_core/**/*.py"), *ROOT.glob("server/**/*.py")])
 
 
