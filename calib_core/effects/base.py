@@ -124,7 +124,9 @@ class Effect:
         unknown = set(values) - set(known)
         if unknown:
             raise ValueError(f"{self.name}: no parameter {sorted(unknown)}; there are {sorted(known)}")
-        self.values = {name: float(values.get(name, 0.0 if not p.grid else p.typical)) for name, p in known.items()}
+        # Of a series every term that is given counts.
+        usual = {n: 0.0 if not p.grid else max(p.grid) if p.discrete else p.typical for n, p in known.items()}
+        self.values = {name: float(values.get(name, value)) for name, value in usual.items()}
 
     @classmethod
     def parameters(cls) -> dict[str, Param]:
