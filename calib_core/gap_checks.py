@@ -166,7 +166,7 @@ class _Look:
         self.kind = "stationary" if recording.stationary else "encoder" if rate is None else "rate"
         if len(self.reference) < FEWEST:
             self.kind = ""
-        self.encoder_step = step_of(angle) if self.kind == "encoder" else 0.0
+        self.encoder_step = step_of(recording.codes(axis)[1]) if self.kind == "encoder" else 0.0
         inside = (output > self.low) & (output < self.high)
         self.step, self.noise = _step(output[inside]), _noise(output, inside, self.interval)
         self.coarse = self.step**2 > COARSE_NOISES**2 * (self.noise**2 - self.step**2 / 12.0)

@@ -120,7 +120,8 @@ class Design:
         if rate is not None:
             rows, averages, mean = with_reference(gyro, axis, rate)
             return cls(rows, averages, mean, "stationary" if recording.stationary else "rate")
-        rows, averages, readings = with_encoder(gyro, axis, *recording.position(axis))
+        calibration = recording.reference_calibration(axis)
+        rows, averages, readings = with_encoder(gyro, axis, *recording.codes(axis), calibration)
         rate = _slopes(rows, readings.angle_deg)
         return cls(rows, averages, rate, "encoder", readings)
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from calib_core.problem import Problem
 from calib_core.recording_check import GYRO_UNITS, MAX_BYTES, MAX_VALUE, MIN_DURATION_S, check, check_increasing
+from calib_core.reference import AxisCalibration, ReferenceCalibration
 from calib_core.segments import Segment, format_segment, parse_segment
 
 __all__ = [
@@ -92,7 +93,21 @@ class Recording:
         return Gyro(GYRO_UNITS[unit], self.valid_only(self.columns[f"{axis}_gyro_{unit}"]), delay_s)
 
     def position(self, axis: str) -> tuple[F64, F64]:
-        """The encoder's real readings, each at its own time: (time_s (m,), angle_deg (m,)); empty without one."""
+        """The encoder's real readings, each at its own time: (time_s (m,), angle_deg (m,)); empty without one.
+
+        Where the header has the encoder's calibration, angles are corrected by it; `codes` are as they were read.
+        """
+        time, angle = self.codes(axis)
+        calibration = self.reference_calibration(axis)
+        return time, angle if calibration is None else calibration.apply(angle)
+
+    def reference_calibration(self, axis: str) -> AxisCalibration | None:
+        """How the encoder of this axis was calibrated; None where it was not."""
+        record = ReferenceCalibration.of(self.header)
+        return None if record is None else record.axes.get(axis)
+
+    def codes(self, axis: str) -> tuple[F64, F64]:
+        """The encoder's readings as `position` gives them, but as they were read: on the grid of its codes."""
         angle = self.columns.get(f"{axis}_position_deg")
         if angle is None:
             return np.empty(0), np.empty(0)

@@ -5,7 +5,7 @@ true rate is exactly zero, so every sample is a row of its own. A reference rate
 per sample. Columns of effects are averaged over the same intervals by ``Averages``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calib_core import encoder_noise
 from calib_core.problem import Problem
 from calib_core.recording import Recording
+from calib_core.reference import AxisCalibration
 from calib_core.whitening import Rows
 
 F64 = NDArray[np.float64]
@@ -200,9 +201,12 @@ def with_reference(s: Samples, axis: str, rate_dps: F64) -> tuple[Rows, Averages
     return rows, Averages(s, time, time, at), rate[at]
 
 
-def with_encoder(s: Samples, axis: str, time_s: F64, angle_deg: F64) -> tuple[Rows, Averages, encoder_noise.Readings]:
+def with_encoder(
+    s: Samples, axis: str, time_s: F64, angle_deg: F64, calibration: AxisCalibration | None = None
+) -> tuple[Rows, Averages, encoder_noise.Readings]:
     """Rows between encoder readings, one per sample inside rests; and the readings used, a rest's as one.
 
+    Codes are told apart by what was read; the angles they stand for are then corrected by the encoder's calibration.
     ``time_s``, ``angle_deg`` (m,) are all readings of the recording; those outside the samples' stretches are left out.
     """
     order = np.argsort(time_s, kind="stable")
@@ -215,6 +219,9 @@ def with_encoder(s: Samples, axis: str, time_s: F64, angle_deg: F64) -> tuple[Ro
     if len(time) < 3:
         raise Problem("fit.no_reference", axis=axis)
     readings = encoder_noise.inspect(time, angle)
+    if calibration is not None:
+        corrected, step = calibration.apply(angle), readings.step_deg * calibration.scale
+        readings = replace(readings, angle_deg=corrected, step_deg=step)
 
     # One reading for each moving reading, one for each rest.
     rest = readings.rest

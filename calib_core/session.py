@@ -17,6 +17,7 @@ from calib_core.certificate import FIELDS
 from calib_core.gyro_models import PRESETS, GyroModel, Ranges, ranges_from_json
 from calib_core.problem import Problem
 from calib_core.recording import Recording, parse_segment
+from calib_core.reference import AxisCalibration
 from calib_core.sequence import PROFILES, STATES
 from calib_core.uncertainty import Budget, Contribution
 
@@ -190,7 +191,7 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
         rest_density=rest or moving,
     )
     difference_V = kalman.filterpy_difference(v.values[:1000], interval_s, adaptive.gain)
-    bias, scale_factor = _budgets(fit, adaptive, profile)
+    bias, scale_factor = _budgets(fit, adaptive, profile, recording.reference_calibration(axis))
     step, warnings = _step_check(recording, axis, profile, gyro_model)
     warnings += [dict(warning) for warning in fit.warnings]
     if not difference_V <= FILTERPY_LIMIT_V:
@@ -254,7 +255,9 @@ def _check_answer(fit: integral_fit.Fit, axis: str, gyro_model: GyroModel) -> No
         raise Problem("session.no_answer", axis=axis, found=1e3 * found, datasheet=1e3 * promised)
 
 
-def _budgets(fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str) -> tuple[Budget, Budget]:
+def _budgets(
+    fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str, encoder: AxisCalibration | None
+) -> tuple[Budget, Budget]:
     """GUM budgets of the certified bias and scale factor.
 
     The thesis' estimator is certified as it is; what it is off by, seen beside the integral fit of the same rows, is
@@ -263,15 +266,17 @@ def _budgets(fit: integral_fit.Fit, adaptive: adaptation.Adaptive, profile: str)
 
     def budget(name: str, fitted: float, adapted: float, *more: Contribution) -> Budget:
         sources = (*fit.contributions(name), *more)
-        excluded = EXCLUDED[name]
+        excluded = tuple(source for source in EXCLUDED[name] if source not in {known.name for known in sources})
         if profile != "thesis":
             return Budget(fitted, sources, excluded)
         return Budget(adapted, (*sources, Contribution("estimator", abs(adapted - fitted))), excluded)
 
-    clock = Contribution("clock", CLOCK_ERROR, distribution="uniform", sensitivity=fit.scale_factor)
+    gains = [Contribution("clock", CLOCK_ERROR, distribution="uniform", sensitivity=fit.scale_factor)]
+    if encoder is not None:
+        gains.append(Contribution("encoder_scale", encoder.scale_uncertainty, sensitivity=fit.scale_factor))
     return (
         budget("bias_V", fit.bias, adaptive.bias_V),
-        budget("scale_factor_V_per_dps", fit.scale_factor, adaptive.scale_factor_V_per_dps, clock),
+        budget("scale_factor_V_per_dps", fit.scale_factor, adaptive.scale_factor_V_per_dps, *gains),
     )
 
 

@@ -15,6 +15,7 @@ from calib_core import session
 from calib_core.certificate import judge, limits
 from calib_core.gyro_models import GyroModel
 from calib_core.recording import Recording
+from calib_core.reference import HEADER, ReferenceCalibration
 from calib_core.sequence import PROFILES, STATES
 from server import __version__
 from server.settings import is_simulated
@@ -54,6 +55,7 @@ def content(
     verdict, judgement = judge(found.axes, spec)
     header = recording.header
     rig = header.get("rig", "")
+    calibration = ReferenceCalibration.of(header)
     return {
         "format": FORMAT,
         "board": header.get("board", ""),
@@ -63,7 +65,8 @@ def content(
         "rig": {
             "url": rig,
             "simulated": is_simulated(rig),
-            "reference_calibration": header.get("reference_calibration", ""),
+            "reference_calibration": header.get(HEADER, "") if calibration is None else calibration.name,
+            "reference": None if calibration is None else calibration.to_json(),
             "clock": _numbers(header, offset_s="clock_offset_s", skew_ppm="clock_skew_ppm"),
         },
         "profile": found.profile,

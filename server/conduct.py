@@ -18,6 +18,7 @@ import numpy as np
 from calib_core import session
 from calib_core.problem import Problem
 from calib_core.recording import Recording
+from calib_core.reference import HEADER
 from calib_core.sequence import Plan
 from server import __version__, engine
 from server.devices.rig import Rig
@@ -120,7 +121,9 @@ class _Conductor:
         """The recording's identity: all that its certificate says of it is read from here."""
         request = self.request
         temperature = request.get("conditions", {}).get("room_temperature_degC")
+        calibration = self.store.rig_records.get(self.rig.url)
         facts = {
+            HEADER: "" if calibration is None else json.dumps(calibration.to_json(), ensure_ascii=False),
             "run": self.run,
             "operator": request.get("operator", ""),
             "note": " ".join(request.get("note", "").split()),

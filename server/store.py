@@ -13,6 +13,7 @@ from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
 from server.store_recordings import Recordings
+from server.store_rig import RigRecords
 from server.store_runs import Runs
 
 
@@ -26,6 +27,7 @@ class Store:
         self.runs = Runs(self.connection)
         self.recordings = Recordings(self.connection)
         self.certificates = Certificates(self.connection)
+        self.rig_records = RigRecords(self.connection)
 
     def recording(self, recording: str) -> Recording:
         return self.recordings.load(recording)

@@ -62,6 +62,11 @@ def _session(db: Database) -> None:
         )
 
 
+@migrations(name="0002_rig_records")
+def _rig_records(db: Database) -> None:
+    db.table("rig_records").create({"id": int, "kind": str, "body": str, "created_at": str}, pk="id")
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

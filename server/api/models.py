@@ -259,6 +259,36 @@ class StartCheckBody(Body):
     gyro_model: Annotated[str, Field(min_length=1, max_length=80)] = "LPY503AL-OUT"
 
 
+class EncoderPairs(Body):
+    points: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]],
+        Field(min_length=2, max_length=200, description="[what the encoder read, the true angle] in deg"),
+    ]
+    standard_uncertainty_deg: Annotated[float, Field(gt=0, lt=10, description="of each true angle")]
+
+
+class ReferenceBody(Body):
+    """How the encoders of the rig were calibrated."""
+
+    date: Line
+    means: Line
+    by: Line = ""
+    axes: dict[Axis, EncoderPairs]
+
+
+class ReferenceGain(BaseModel):
+    """What follows for one axis: true degrees for one of the encoder's, and its relative standard uncertainty."""
+
+    scale: float
+    scale_uncertainty: float
+
+
+class Reference(Answer):
+    record: dict[str, Any] | None
+    name: str
+    gains: dict[str, ReferenceGain]
+
+
 class LeaseBody(Body):
     holder: Annotated[str, Field(min_length=1, max_length=80), _LINE, AfterValidator(_one_line)]
 

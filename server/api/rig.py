@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Response
 
+from calib_core.reference import ReferenceCalibration
 from server import texts
 from server.api import models
 from server.api.common import Here, Language, Services
@@ -82,6 +83,36 @@ def start_check(body: models.StartCheckBody, here: Here, lang: Language, lease: 
     here.lease.check(lease)
     here.supervisor.start_check(here.store.gyro_models.get(body.gyro_model).to_json())
     return models.Rig(**shown(here, lang))
+
+
+@router.get("/reference", summary="How the encoders of this rig were calibrated, if they were")
+def reference(here: Here) -> models.Reference:
+    return _reference(here.store.rig_records.get(here.supervisor.url))
+
+
+@router.put("/reference", summary="The encoders' calibration from now on", responses=declared(409))
+def calibrated(body: models.ReferenceBody, here: Here, lease: LeaseToken = None) -> models.Reference:
+    here.lease.check(lease)
+    record = ReferenceCalibration.from_json(body.model_dump())
+    here.store.rig_records.set(here.supervisor.url, record)
+    return _reference(record)
+
+
+@router.delete("/reference", status_code=204, summary="Not calibrated any more", responses=declared(409))
+def uncalibrated(here: Here, lease: LeaseToken = None) -> Response:
+    here.lease.check(lease)
+    here.store.rig_records.set(here.supervisor.url, None)
+    return Response(status_code=204)
+
+
+def _reference(record: ReferenceCalibration | None) -> models.Reference:
+    if record is None:
+        return models.Reference(record=None, name="", gains={})
+    gains = {
+        axis: models.ReferenceGain(scale=found.scale, scale_uncertainty=found.scale_uncertainty)
+        for axis, found in record.axes.items()
+    }
+    return models.Reference(record=record.to_json(), name=record.name, gains=gains)
 
 
 @router.post("/lease", summary="Hold the rig, or go on holding it", responses=declared(409))

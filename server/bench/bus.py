@@ -158,6 +158,6 @@ def _bench(baud: int = 1_000_000, latency_ms: float = 1.0) -> Iterator[tuple[Any
     from server import emulators
     from server.devices.address import table_of
 
-    with closing(emulators.start(SEED, baud=baud, latency_ms=latency_ms)) as bench:
-        with closing(table_of(bench.url)) as table:
-            yield bench, table
+    bench = emulators.start(SEED, baud=baud, latency_ms=latency_ms)
+    with closing(bench), closing(table_of(bench.url)) as table:
+        yield bench, table

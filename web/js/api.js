@@ -61,6 +61,9 @@ export const api = {
   chooseRig: (body) => call("PUT", "/rig", body),
   checkRig: () => call("POST", "/rig/check"),
   startCheck: (gyro_model) => call("POST", "/rig/start-check", { gyro_model }),
+  reference: () => call("GET", "/rig/reference"),
+  setReference: (record) => call("PUT", "/rig/reference", record),
+  dropReference: () => call("DELETE", "/rig/reference"),
   emergencyStop: () => call("POST", "/rig/stop"),
   async holdRig(holder) {
     const lease = await call("POST", "/rig/lease", { holder });

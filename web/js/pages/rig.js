@@ -3,6 +3,7 @@
 import { api } from "../api.js";
 import { facts, h, say, table } from "../dom.js";
 import { partsList, rigCard } from "../rig_card.js";
+import { referenceCard } from "../rig_reference.js";
 import { page, rigSentence } from "../shell.js";
 import { fixed, plain, t } from "../text.js";
 
@@ -11,9 +12,11 @@ page("rig", async (main) => {
   const card = h("section", { class: "panel stack" });
   const limits = h("section", { class: "panel stack" });
   const physics = h("section", { class: "panel stack", id: "physics" });
+  const reference = h("section", { class: "panel stack", id: "reference" });
   const holder = h("section", { class: "panel stack" });
-  main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, physics, limits, holder)));
+  main.append(h("h1", {}, t("page.rig")), state, h("div", { class: "columns" }, card, h("div", { class: "stack" }, physics, limits, reference, holder)));
   const choose = rigCard(card, { full: true });
+  const calibration = referenceCard(reference);
 
   const name = h("input", { id: "holder", autocomplete: "name", maxlength: 80 });
   const error = h("p", { class: "error", role: "alert" });
@@ -50,6 +53,7 @@ page("rig", async (main) => {
     state.textContent = rigSentence(rig);
     choose.show(rig);
     showChecks(rig);
+    calibration.show(rig);
     told.textContent = rig.lease ? t("rig.lease", { holder: rig.lease.holder }) : t("rig.no_lease");
     limits.replaceChildren(h("h2", {}, t("rig.limits")), facts([[t("rig.address"), rig.url]]),
       table(["", { n: `${t("rig.from")}, deg` }, { n: `${t("rig.to")}, deg` }, { n: `${t("rig.top_speed")}, deg/s` }],
