@@ -28,6 +28,8 @@ from calib_core.recording import Recording
 
 F64 = NDArray[np.float64]
 
+TOLERATED = 0.003
+"""So much better may the error without an effect be: a small effect's gain drowns in the windows' own scatter."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
 """Effects that are no shape in the residual: each has a test of its own, or can have none."""
 
@@ -76,6 +78,7 @@ def diagnose(
     search.run()
     search.merge()
     search.confirm()
+    _agree(search)
     _structure(answer, search)
     if "mains_hum" in pool:
         line = find_hum(search.space.design.averages.samples, moving=search.space.design.moves)
@@ -153,6 +156,20 @@ def _clipped(
         return space, search
     answer.clip, answer.clip_gain = clip, everything - clipped
     return kept, without
+
+
+def _agree(search: Search) -> None:
+    """Drops what does not lower the error on data not seen, however sure it looks where it was fitted."""
+    while len(search.chosen) > search.given:
+        now = Explanation(search.space, search.chosen).error().held_out_rms_dps
+        less = {
+            k: Explanation(search.space, [*search.chosen[:k], *search.chosen[k + 1 :]]).error().held_out_rms_dps
+            for k in range(search.given, len(search.chosen))
+        }
+        worst = min(less, key=less.__getitem__)
+        if less[worst] >= now * (1.0 - TOLERATED):
+            return
+        del search.chosen[worst], search.findings[worst - search.given]
 
 
 def _structure(answer: Diagnosis, search: Search) -> None:

@@ -168,6 +168,9 @@ class Space:
         single, between, (begin, at_begin), (end, at_end), dt = self._intervals
         out = np.zeros((len(averages.at), shapes.shape[1]))
         if acts is Acts.ANGLE:
+            if self.design.readings is None:
+                # Without an encoder every row is a sample in motion; at its rests an encoder's error does not change.
+                out[single] = np.gradient(shapes, averages.samples.interval_s, axis=0)[averages.at[single]]
             out[between] = (_inside(shapes, end, at_end) - _inside(shapes, begin, at_begin)) / dt
             return -self.scale_factor * out
         out[single] = shapes[averages.at[single]]
@@ -197,7 +200,9 @@ class Space:
         return ~between, between, place(begin), place(end), (end - begin)[:, None]
 
     def _felt(self) -> F64:
-        """(k,) the measured rate, zero at rest."""
+        """(k,) the measured rate, zero at rest; the reference's own where it is a rate."""
+        if self.design.readings is None:
+            return self.covariates.rate_dps
         moving = self.covariates.rate_dps != 0.0
         return np.where(
             moving, (self.design.averages.samples.output - self.values[0]) / (self.scale_factor or 1.0), 0.0
@@ -209,7 +214,9 @@ class Space:
         tau = setting[0] if setting else 0.0
         shape = self._felt()
         if tau:
-            shape = shape + effect.curvature * tau * np.gradient(shape, self.covariates.interval_s)
+            # In terms of the true rate, which only a reference rate tells, the series turns round.
+            bend = effect.curvature if self.design.readings is not None else effect.curvature - 1.0
+            shape = shape + bend * tau * np.gradient(shape, self.covariates.interval_s)
         sign = -1.0 if effect.name == "angular_acceleration" else 1.0
         return sign * shape[:, None]
 
