@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from server.bench import run
-from server.bench.gap_campaign import INSIDE, NO_SHAPE, ON_THE_TABLE, Case, one_effect
+from server.bench.gap_campaign import INSIDE, ON_THE_TABLE, Case, one_effect
 from server.bench.gap_oracle import evidence, whitened
-from server.bench.gap_records import EFFECTS, ENCODER_STEP_DEG, record
-
-QUIET = {"white_V": 1e-6, "reference": "rate"}
+from server.bench.gap_records import EFFECTS, record
 
 
 def test_a_record_of_each_kind_is_diagnosed_rightly() -> None:
@@ -21,13 +19,11 @@ def test_a_record_of_each_kind_is_diagnosed_rightly() -> None:
 
 
 def test_every_effect_of_the_generator_leaves_its_mark_and_none_leaves_none() -> None:
-    assert evidence(record(1, {}, **QUIET), QUIET) < 1.0
+    assert evidence(1, {}, {}) == 0.0
     for name in EFFECTS:
-        if name not in (*ON_THE_TABLE, *NO_SHAPE):
-            assert evidence(record(1, {name: 1.0}, **QUIET), QUIET) > 100.0, name
-    for name in ON_THE_TABLE:
-        plain, bent = (record(1, effects).columns["x_position_deg"] for effects in ({}, {name: 1.0}))
-        assert np.ptp(plain - bent) >= ENCODER_STEP_DEG, name
+        seen_by = {} if name in ON_THE_TABLE else {"reference": "rate"}
+        if name != "adc_quantization":
+            assert evidence(1, {name: 1.0}, seen_by) > 30.0, name
 
 
 def test_a_case_can_be_made_again_from_its_name() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib_core.recording import Recording
-from server.bench.gap_oracle import detectable
+from server.bench.gap_oracle import detectable, evidence
 from server.bench.gap_records import EFFECTS, OUTSIDE_THE_LIBRARY, Record, record
 
 PROCESSES = 2
@@ -78,6 +78,8 @@ class Outcome:
     held_out: float
     floor: float
     """RMS of the generator's own noise in the same statistic."""
+    oracle: float
+    """√NCP of the truth for one who knows its shape and the noise."""
     cpu_s: float
 
     @property
@@ -132,6 +134,7 @@ def play(case: Case) -> Outcome:
         said["unknown"]["covariate"] if said["unknown"] else "",
         said["after"]["held_out_rms_dps"] if said["after"] else math.nan,
         true_floor(made),
+        evidence(case.seed, made.effects, case.options) if made.effects else 0.0,
         cpu_s,
     )
 
@@ -172,10 +175,10 @@ def conditions(k: int) -> dict[str, Any]:
 
 
 def coloured(k: int) -> dict[str, float]:
-    """White and AR(1) noise correlated over 0.1 to 2 s, a third to all of the white's size."""
+    """AR(1) noise correlated over 0.1 to 2 s, with as much slow noise as hidden_effects' coloured records have."""
     rng = np.random.default_rng([SEED, k])
     correlation_s = math.exp(rng.uniform(math.log(0.1), math.log(2.0)))
-    return {"ar1_V": 1.2e-3 * float(rng.uniform(0.33, 1.0)), "phi": math.exp(-0.01 / correlation_s)}
+    return {"ar1_V": 7.5e-4 * math.sqrt(0.1 / correlation_s), "phi": math.exp(-0.01 / correlation_s)}
 
 
 def one_effect(strength: float, each: int) -> Iterator[Case]:

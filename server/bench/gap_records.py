@@ -44,6 +44,7 @@ class Record:
     gyro_noise_dps: F64 = field(default_factory=lambda: np.empty(0))
     encoder_error_deg: F64 = field(default_factory=lambda: np.empty(0))
     clipped: Mask = field(default_factory=lambda: np.empty(0, bool))
+    effects: Mapping[str, float] = field(default_factory=dict)
 
 
 class _Path:
@@ -453,4 +454,5 @@ def record(
         gyro_noise_dps=(measured - clean) / scale,
         encoder_error_deg=angle - phase - world.encoder[rows],
         clipped=clipped,
+        effects=dict(effects),
     )
