@@ -25,6 +25,8 @@ F64 = NDArray[np.float64]
 FORMAT = "gyro-compensation 1"
 OWN_WAY = {"bandwidth_lag", "angular_acceleration", "dead_band", "time_offset", "input_loading", "saturation"}
 """Undone otherwise than by subtracting a formula."""
+TOLD = {"time_offset", "saturation"}
+"""Told beside the rate: the rate's age, and whether the output is at a limit."""
 UNFORETOLD = {"mains_hum": "phase", "bias_random_walk": "random", "adc_quantization": "rounding", "clock_skew": "clock"}
 TURNS, CLOSE_DPS = 30, 1e-9
 """Effects that depend on the rate are taken out by turns, until the rate changes by less than this."""
@@ -52,7 +54,7 @@ class Compensation:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Those that are undone."""
+        """Those that are undone, or told beside the rate."""
         return tuple(e for e in self.model.effects if _reason(e) is None)
 
     @property
@@ -61,9 +63,14 @@ class Compensation:
         return tuple((e.name, reason) for e in self.model.effects if (reason := _reason(e)) is not None)
 
     @property
+    def undone(self) -> tuple[str, ...]:
+        """Names of the effects that the rate is free of."""
+        return tuple(e.name for e in self.effects if e.name not in TOLD)
+
+    @property
     def delay_s(self) -> float:
         """So much before its sample's time stamp the rate was felt, beside half a sampling interval for a lag."""
-        return sum(e.values["delay"] for e in self.effects if e.name == "time_offset")
+        return self.value("time_offset", "delay")
 
     @property
     def halved(self) -> bool:
@@ -128,7 +135,8 @@ class Compensation:
         """From CONTRACT 3's JSON: the model with what was missing, or ``as_asked`` the model as it was given."""
         model = answer.get("model" if as_asked else "after")
         if not isinstance(model, Mapping) or not model.get("parameters"):
-            raise Problem("compensation.no_model", axis=answer.get("axis"))
+            why = {"code": answer.get("code", ""), "values": answer.get("values", {})}
+            raise Problem("compensation.no_model", axis=answer.get("axis"), reason=why)
         rows = list(model["parameters"])
         if not as_asked:
             there = {row["name"] for row in rows}

@@ -144,9 +144,14 @@ def write_python(compensation: Compensation) -> str:
     )
 
 
+def inputs(compensation: Compensation) -> tuple[str, ...]:
+    """The arguments of the written function, the output first."""
+    return _Body(compensation).arguments
+
+
 def _head(compensation: Compensation, body: "_Body", function: str) -> list[str]:
     unit = compensation.model.unit
-    effects = ", ".join(e.name for e in compensation.effects if e.name not in ("time_offset", "saturation")) or "none"
+    effects = ", ".join(compensation.undone) or "none"
     late = compensation.delay_s
     lines = [
         f"Rate of a gyro about axis {compensation.axis}, board {compensation.board or 'not told'}.",

@@ -73,7 +73,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
             "parameters": parameters(d.after),
         },
     }
-    out["model"]["parameters"] = parameters(d.before)
+    out["model"] |= {"parameters": parameters(d.before), "reference": dict(space.covariates.reference)}
     if d.unknown is not None:
         out["unknown"] = {"covariate": d.unknown.covariate, "p": p_value(d.unknown.z)}
     values = {

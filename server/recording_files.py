@@ -1,6 +1,8 @@
 """Recordings on disk, in the form that the file's name asks for."""
 
 import gzip
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -21,18 +23,25 @@ def form_of(path: Path) -> str:
 def save(recording: Recording, path: Path) -> None:
     """Writes ``path`` whole or not at all; its directory is made where there is none."""
     form = form_of(path)
+    with whole(path) as file:
+        if form == ".parquet":
+            write_parquet(recording, file)
+        elif form == ".csv":
+            write_csv(recording, file)
+        else:
+            # No file name and no time inside: the same recording gives the same bytes.
+            with gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
+                write_csv(recording, cast(BinaryIO, packed))
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[BinaryIO]:
+    """A file that is at ``path`` when the block ends, and nowhere when it fails; its directory is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
-            if form == ".parquet":
-                write_parquet(recording, file)
-            elif form == ".csv":
-                write_csv(recording, file)
-            else:
-                # No file name and no time inside: the same recording gives the same bytes.
-                with gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
-                    write_csv(recording, cast(BinaryIO, packed))
+            yield file
         part.replace(path)
     except BaseException:
         part.unlink(missing_ok=True)

@@ -2,11 +2,14 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from recordings import csv_bytes, csv_lines
 
 from calib_core.recording import Recording, read
+from server.bench.gap_records import record
 from server.cli import main
 from server.recording_files import save
 from server.store import Store
@@ -124,3 +127,72 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pyte
     monkeypatch.undo()
     save(recording, path)
     assert path.read_bytes() == before
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a gyro whose zero moves with temperature, with its true rate."""
+    made = record(3, {"bias_temperature": 2.0}, reference="rate")
+    names = tuple(dict.fromkeys(made.segments))
+    columns = dict(made.columns)
+    codes = np.array([names.index(name) for name in made.segments], np.int32)
+    path = tmp_path_factory.mktemp("warm") / "warm.csv"
+    save(Recording(columns.pop("time_s"), columns, codes, names, {"board": "W-1"}), path)
+    return path
+
+
+def test_the_model_of_a_recording_compensates_as_python_json_and_c(
+    warm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = {ending: tmp_path / f"gyro{ending}" for ending in (".py", ".json", ".h")}
+    code, out, _ = run(capsys, "export", warm, "--out", paths[".py"])
+    assert code == 0
+    assert "bias_temperature" in out
+    room: dict[str, Any] = {}
+    exec(paths[".py"].read_text(encoding="utf-8"), room)
+    recording = read(warm.read_bytes())
+    rate, volts = recording.columns["x_rate_dps"], recording.columns["x_gyro_v"]
+    error = (
+        np.array([room["rate_dps"](v, t) for v, t in zip(volts, recording.columns["temperature_c"], strict=True)])
+        - rate
+    )
+    plain = (volts - np.polynomial.Polynomial.fit(rate, volts, 1)(rate)) / room["SCALE_FACTOR"]
+    noise = 1.25e-3 / room["SCALE_FACTOR"]
+    assert np.std(error) < 1.01 * noise < 1.1 * noise < np.std(plain)
+
+    code, out, _ = run(capsys, "export", warm, "--out", paths[".json"], "--json")
+    assert json.loads(out)["effects"] == ["bias_temperature"]
+    code, *_ = run(capsys, "export", paths[".json"], "--out", paths[".h"])
+    assert code == 0
+    assert "gyro_x_rate_dps(GYRO_REAL output_V, GYRO_REAL temperature_c)" in paths[".h"].read_text(encoding="ascii")
+    code, out, _ = run(capsys, "export", warm, "--effects", "", "--out", tmp_path / "base.json", "--json")
+    assert json.loads(out)["effects"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["warm.csv", "--out", "gyro.exe"], "allowed are .csv, .csv.gz, .parquet, .json, .h, .py"),
+        (["warm.csv", "--axis", "z", "--out", "gyro.h"], "Axis z"),
+        (["warm.csv", "--effects", "magic", "--out", "gyro.h"], "magic"),
+        (["short.csv", "--out", "gyro.h"], "has no fitted model to export. The recording holds"),
+        (["odd.json", "--out", "gyro.h"], "This is no compensation"),
+    ],
+)
+def test_a_model_that_cannot_be_exported_is_told_in_one_sentence(
+    words: list[str],
+    sentence: str,
+    warm: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "warm.csv").symlink_to(warm)
+    (tmp_path / "short.csv").write_bytes(csv_bytes(csv_lines(300)))
+    (tmp_path / "odd.json").write_text("[1]", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, "export", *words)
+    assert (code, out) == (2, "")
+    assert sentence in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "gyro.h").exists()
