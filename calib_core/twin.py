@@ -137,7 +137,7 @@ class Plant:
             columns += [0.01 * (temperature + 0.1 * noise[0]), 0.5 * (supply + 0.001 * noise[1])]
         volts = self.daq.convert(np.column_stack(columns))
         self.now_s = float(true[-1])
-        return Samples(own, volts, self.host_time_s + self.daq.latency_s())
+        return Samples(own, volts, self.host_time_s + self.daq.latency_s(n))
 
     def _surroundings(self, true_s: F64) -> tuple[F64, F64]:
         """Temperature (°C) and supply (V) around the board: a bench that warms by a degree in half an hour."""

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
+PIECE = 50  # samples in one USB transfer
+
 
 @dataclass(frozen=True)
 class DaqSpec:
@@ -47,8 +49,12 @@ class Daq:
         codes *= self.spec.step_V
         return codes
 
-    def latency_s(self) -> float:
-        """How long after its last sample the next transfer reaches the host."""
-        late = self._rng.exponential(self.spec.transfer_scatter_s)
-        hiccup = self.spec.hiccup_s if self._rng.random() < 0.01 else 0.0
+    def latency_s(self, n: int) -> float:
+        """How long after its last sample a transfer of ``n`` reaches the host.
+
+        A long one comes in pieces, of which the promptest tells of the clocks: it stands for all.
+        """
+        pieces = max(1, n // PIECE)
+        late = self._rng.exponential(self.spec.transfer_scatter_s / pieces)
+        hiccup = self.spec.hiccup_s if self._rng.random() < 0.01**pieces else 0.0
         return self.spec.transfer_s + float(late) + hiccup

@@ -1,8 +1,8 @@
 """Ties of the first diagnosis, and what one recommended motion made of them, on the twin.
 
 Every board has one hidden effect, of a size that a short or slow motion leaves tied. Right is: after the motion that
-the instrument recommends and expects to decide, all data together name the truth, tied with nothing but what the instrument
-said would remain tied with it (a warm-up slow enough is a drift, whatever the motion).
+the instrument recommends and expects to decide, all data together name the truth, tied with nothing but what was said
+to remain tied with it (a warm-up slow enough is a drift, whatever the motion).
 """
 
 import zlib
