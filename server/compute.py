@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -124,6 +124,15 @@ def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, An
     with Store(data) as store:
         gyro_model = store.gyro_models.get(model) if model else None
         return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec))
+
+
+def diagnose(data: Path, recording: str, axis: str | None, effects: Sequence[str]) -> dict[str, Any]:
+    from server import diagnosis
+    from server.store import Store
+
+    with Store(data) as store:
+        row = store.recordings.row(recording)
+        return diagnosis.of_recording(store.recording(recording), axis=axis, effects=effects, file=row["name"])
 
 
 def verify(data: Path, number: str) -> dict[str, Any]:

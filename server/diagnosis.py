@@ -77,7 +77,18 @@ def explained(answer: Words) -> Words:
         finding |= _finding(effect_words(names), min(1.0, finding["p"] * tested))
     if answer["error"] is not None:
         answer |= _verdict(answer, tied)
-    return answer | {"limits": list(_limits(answer))}
+    return dict(plain(answer | {"limits": list(_limits(answer))}))
+
+
+def plain(part: Any) -> Any:
+    """As JSON has it: no numbers that are none."""
+    if isinstance(part, Mapping):
+        return {key: plain(value) for key, value in part.items()}
+    if isinstance(part, list | tuple):
+        return [plain(value) for value in part]
+    if isinstance(part, float) and not math.isfinite(part):
+        return None
+    return part.item() if hasattr(part, "item") else part
 
 
 def told(answer: Words, lang: str) -> Words:
@@ -153,6 +164,26 @@ def _limits(answer: Words) -> Iterator[Words]:
         names = [c["effect"] for c in answer["candidates"] if c["status"] == status]
         if names:
             yield limit(status, effects=[effect_word(name) for name in names])
+
+
+def cards(lang: str) -> list[Words]:
+    """The effect library in a language, in alphabetical order; what has no text there is in the effect's own words."""
+    from calib_core.effects import library
+
+    return [card(effect, lang) for effect in library().values()]
+
+
+def card(effect: "type[Effect]", lang: str) -> Words:
+    """Name, place, parameters and physics card of an effect."""
+    known = texts(lang)
+    told = {key: known.get(f"effects.{effect.name}.{key}", text) for key, text in effect.card().items()}
+    parameters = [
+        {"name": name, "unit": p.unit, "typical": p.typical, "bounds": p.bounds, "grid": list(p.grid)}
+        for name, p in effect.parameters().items()
+    ]
+    title = known.get(f"effects.{effect.name}.name", effect.name)
+    place = {"name": effect.name, "title": title, "stage": effect.stage.value, "needs": list(effect.needs)}
+    return {**told, **place, "parameters": parameters}
 
 
 # --- words -------------------------------------------------------------------------------------------------------

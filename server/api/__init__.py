@@ -1,6 +1,18 @@
 """HTTP under /api/v1: one router a noun."""
 
-from server.api import boards, certificates, gyro_models, health, live, recordings, rig, runs, thesis
+from server.api import (
+    boards,
+    certificates,
+    diagnoses,
+    experiments,
+    gyro_models,
+    health,
+    live,
+    recordings,
+    rig,
+    runs,
+    thesis,
+)
 
 ROUTERS = (
     health.router,
@@ -10,6 +22,8 @@ ROUTERS = (
     runs.router,
     live.router,
     recordings.router,
+    diagnoses.router,
+    experiments.router,
     certificates.router,
     thesis.router,
 )

@@ -1,0 +1,106 @@
+"""What a recording's model is missing, and the effects it can be made of."""
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel, Field
+
+from server import compute, diagnosis
+from server.api.common import Here, Language
+from server.api.models import Answer, Body
+from server.problems import declared
+
+router = APIRouter(tags=["diagnoses"])
+
+EffectName = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class DiagnosisBody(Body):
+    axis: Literal["x", "y", "z"] | None = Field(None, description="the recording's own where it is left out")
+    effects: list[EffectName] = Field([], max_length=30, description="effects that the model already has")
+
+
+class Said(Answer):
+    """Something told: a sentence, and the code and values it is made of."""
+
+    code: str
+    values: dict[str, Any]
+    sentence: str
+
+
+class Found(Said):
+    effect: str
+    two_delta_lnL: float | None
+    p: float | None
+
+
+class Diagnosis(Answer):
+    """CONTRACT 3. ``error``, ``noise`` and ``after`` are null where the recording is not testable."""
+
+    recording: dict[str, Any]
+    axis: str
+    unit: str | None
+    verdict: Literal["adequate", "missing", "ambiguous", "unknown", "not_testable"]
+    sentence: str
+    code: str
+    values: dict[str, Any]
+    checks: list[Said]
+    model: dict[str, Any]
+    noise: dict[str, float | None] | None
+    error: dict[str, Any] | None
+    where_it_fails: list[Said]
+    missing: list[Found]
+    rivals: list[list[str]]
+    rival_sets: list[list[list[str]]]
+    candidates: list[dict[str, Any]]
+    unknown: dict[str, Any] | None
+    next_experiment: dict[str, Any] | None
+    after: dict[str, Any] | None
+    limits: list[Said]
+
+
+class Parameter(BaseModel):
+    name: str
+    unit: str = Field(description="{out} stands for the recording's unit")
+    typical: float
+    bounds: tuple[float, float]
+    grid: list[float] = Field(description="where the search begins; empty for a linear parameter")
+
+
+class Effect(BaseModel):
+    """One physical effect: where it acts, what it is, how it shows, and how to provoke it."""
+
+    name: str
+    title: str
+    stage: Literal["table", "sensor", "electrics", "acquisition"]
+    needs: list[str]
+    parameters: list[Parameter]
+    summary: str
+    equation: str
+    cause: str
+    signature: str
+    confused_with: str
+    excite_it: str
+    source: str
+
+
+class Effects(BaseModel):
+    items: list[Effect]
+    next: None = None
+
+
+@router.post(
+    "/recordings/{recording}/diagnosis",
+    summary="Compare the model with a recording and name what is missing",
+    responses=declared(404),
+)
+async def diagnose(recording: str, body: DiagnosisBody, here: Here, lang: Language) -> Diagnosis:
+    answer = await here.compute.run(
+        compute.diagnose, here.store.data, recording, body.axis, tuple(dict.fromkeys(body.effects))
+    )
+    return Diagnosis.model_validate(diagnosis.told(answer, lang))
+
+
+@router.get("/effects", summary="The effect library: equations, causes, signatures, parameters")
+def effects(lang: Language) -> Effects:
+    return Effects.model_validate({"items": diagnosis.cards(lang)})
