@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from server.live import LiveRun
 
 log = logging.getLogger("gyrobench.worker")
+IDLE_S = 2.0  # between looks at a rig with nothing to do
 LEAST_GAP_S = 0.045  # the engine's blocks are 50 ms apart: each makes a frame, twenty a second
 
 
@@ -61,8 +62,16 @@ class Worker:
         self._tell("rig", self._status())
         threading.Thread(target=_warm_up, name="warm-up", daemon=True).start()
         try:
+            shown = None
             while True:
-                match self._commands.get():
+                try:
+                    command = self._commands.get(timeout=IDLE_S)
+                except queue.Empty:
+                    # Whoever looks at the rig's page sees a cable that comes off, and how warm the servos are.
+                    if (status := self._status()) != shown:
+                        self._tell("rig", shown := status)
+                    continue
+                match command:
                     case ("quit",):
                         return
                     case ("run", str(run), float(speed)):

@@ -188,6 +188,9 @@ class DynamixelTable:
             return taken
 
     def telemetry(self) -> dict[str, Telemetry]:
+        """What the servos last said of themselves. Raises the fault that ended it."""
+        if self._fault is not None:
+            raise self._fault
         said = {}
         for axis, servo in self._servos.items():
             last = servo.last or State(CENTRE, 0.0, 0.0, math.nan, math.nan)

@@ -11,15 +11,13 @@ from server.devices.rig import Rig
 
 def rehearse(rig: Rig, board: str, gyro_model: GyroModel, abort: start_checks.Abort) -> None:
     """Raises DeviceError where the table does not follow, or `rig.rehearsal` where the gyro does not answer as it has
-    to. The rig is safe afterwards, and has to be begun anew."""
+    to; the caller then makes the rig safe. Else it is safe, and has to be begun anew."""
     if rig.simulated or rig.rehearsed == board:
         return
-    try:
-        rig.begin()
-        for check in start_checks.gyro_answers(rig, gyro_model, abort=abort):
-            if check.ok is False:
-                cure = {"code": check.cure, "values": check.values}
-                raise DeviceError("rig.rehearsal", found={"code": check.code, "values": check.values}, cure=cure)
-    finally:
-        rig.safe()
+    rig.begin()
+    for check in start_checks.gyro_answers(rig, gyro_model, abort=abort):
+        if check.ok is False:
+            cure = {"code": check.cure, "values": check.values}
+            raise DeviceError("rig.rehearsal", found={"code": check.code, "values": check.values}, cure=cure)
+    rig.safe()
     rig.rehearsed = board

@@ -18,7 +18,7 @@ from calib_core.gyro_models import GyroModel
 from calib_core.sequence import Axis, Motion
 from server.devices import DeviceError
 from server.devices.clock import ClockRelation
-from server.devices.protocols import Daq, Table
+from server.devices.protocols import Daq, Table, Telemetry
 
 F64 = NDArray[np.float64]
 
@@ -160,7 +160,10 @@ class Rig:
 
     def status(self) -> list[dict[str, Any]]:
         """What is known of each part, without asking it: "part", "ok" (None: not known), "code" and "values"."""
-        telemetry = self.table.telemetry() if self.connected else {}
+        telemetry: Mapping[str, Telemetry] = {}
+        if self.connected:
+            with suppress(DeviceError), self._asking("servo"):
+                telemetry = self.table.telemetry()
         known: list[dict[str, Any]] = []
         for part in (*(f"servo {axis}" for axis in self.axes), "daq", "gyro"):
             fault = self._faults.get(part) or self._faults.get(part.split()[0])
