@@ -229,9 +229,9 @@ def join(hand: Recording, run: Recording, axis: str, after_s: float = PAUSE_S) -
     return Recording.join([hand, replace(run, time_s=np.round(run.time_s + shift, 6), columns=columns)])
 
 
-def model_of(recording: Recording) -> GyroModel | None:
-    """The gyro model that the recording's header carries."""
-    text = recording.header.get("gyro_model", "")
+def model_of(header: Mapping[str, str]) -> GyroModel | None:
+    """The gyro model that a recording's header carries."""
+    text = header.get("gyro_model", "")
     try:
         return GyroModel.from_json(json.loads(text)) if text else None
     except ValueError:
@@ -240,7 +240,7 @@ def model_of(recording: Recording) -> GyroModel | None:
 
 def ranges(recording: Recording, gyro_model: GyroModel | None = None) -> dict[str, float]:
     """Up to what rate (deg/s) each axis of the sensor may be turned, by its datasheet."""
-    gyro_model = gyro_model or model_of(recording) or PRESETS["LPY503AL-OUT"]
+    gyro_model = gyro_model or model_of(recording.header) or PRESETS["LPY503AL-OUT"]
     return {axis: sheet.range_dps for axis, sheet in gyro_model.axes.items()}
 
 

@@ -1,6 +1,9 @@
 """The next experiment: proposed from a recording, run on a rig, joined to the data in hand, and judged again."""
 
+import json
 from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
@@ -13,6 +16,7 @@ if TYPE_CHECKING:
     from calib_core.recording import Recording
     from calib_core.sequence import Axis
     from server.devices.rig import Rig
+    from server.store import Store
 
 Words = dict[str, Any]
 
@@ -93,7 +97,7 @@ def perform(
 
     if axis not in rig.axes:
         raise Problem("experiment.no_axis", axis=axis)
-    gyro_model = experiment.model_of(recording) or PRESETS["LPY503AL-OUT"]
+    gyro_model = experiment.model_of(recording.header) or PRESETS["LPY503AL-OUT"]
     steps = [Excitation.from_json(one) for one in motion]
     plan = plan_of(steps, experiment=name, axis=axis, gyro_model=gyro_model)
     done = engine.record(plan, rig, board=recording.header.get("board", ""))
@@ -117,3 +121,97 @@ def run(
         experiments.append({**following, "before": answer["verdict"]})
         answer = propose(recording, axis, rig.axes, effects=effects)
     return answer | {"experiments": experiments}, recording
+
+
+# --- in the server: by the store, each step in the process that has to do it --------------------------------------
+def proposed(
+    data: Path, recording: str, axis: str, effects: Sequence[str], axes: Mapping[str, Mapping[str, Any]], rig: str
+) -> str:
+    """Stores the proposal for a stored recording on a rig with ``axes`` (as the worker told them); gives its id.
+
+    Raises Problem where nothing is open that a motion could settle.
+    """
+    from calib_core.sequence import Axis
+    from server.store import Store
+
+    with Store(data) as store:
+        hand = store.recording(recording)
+        if axis not in hand.axes:
+            raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(hand.axes))
+        known = {name: Axis(**facts) for name, facts in axes.items()}
+        answer = propose(hand, axis, known, effects=effects)
+        following = answer["next_experiment"]
+        if following is None:
+            raise Problem("experiment.nothing_open", axis=axis)
+        row = store.experiments.add(recording, axis, effects, {**following, "verdict": answer["verdict"], "rig": rig})
+        return str(row["id"])
+
+
+def create(
+    store: "Store", row: Mapping[str, Any], axes: Mapping[str, Mapping[str, Any]], *, rig: str, speed: float
+) -> str:
+    """The queued run of a stored experiment, checked against sensor and rig; gives its id."""
+    from calib_core import sequence
+    from calib_core.excitation import Excitation, plan_of
+    from calib_core.experiment import model_of
+    from server.store_boards import USUAL_MODEL
+
+    header, board = store.recordings.row(row["recording"])["header"], store.recordings.row(row["recording"])["board"]
+    gyro_model = model_of(header) or store.gyro_models.get(USUAL_MODEL)
+    motion = [Excitation.from_json(one) for one in row["proposal"]["motion"]]
+    plan = plan_of(motion, experiment=row["id"], axis=row["axis"], gyro_model=gyro_model)
+    if axes:
+        sequence.check(plan, {name: sequence.Axis(**facts) for name, facts in axes.items()})
+    shown = speed if speed < float("inf") else "max"
+    request = {"board": board, "experiment": row["id"], "seed": plan.seed, "readings": plan.readings, "rig": rig}
+    with store.connection.write():
+        if board:
+            store.boards.ensure(board, gyro_model=gyro_model.id or USUAL_MODEL)
+        recording = store.recordings.create(board=board, name=board or row["id"], source="experiment", header={})
+        run = store.runs.create(
+            board=board,
+            gyro_model=gyro_model.id or USUAL_MODEL,
+            profile=plan.profile,
+            recording=recording,
+            request={**request, "speed": shown},
+            plan=plan.to_json(),
+            states=[state.name for state in plan.states],
+        )
+        store.experiments.begin(row["id"], run)
+    return run
+
+
+def judged(data: Path, experiment: str) -> None:
+    """Joins a finished experiment to its recording, keeps both as one recording, and stores the joined diagnosis."""
+    from calib_core.experiment import join
+    from server.store import Store
+
+    with Store(data) as store:
+        row = store.experiments.get(experiment)
+        if row["result"] is not None:
+            return
+        hand = store.recording(row["recording"])
+        done = store.recording(store.runs.get(row["run"])["recording"])
+        try:
+            both = join(hand, done, row["axis"], _between(hand.header, done.header))
+            answer = propose(both, row["axis"], effects=row["effects"])
+            board = done.header.get("board", "")
+            kept = store.recordings.add(both, board=board, name=f"{board}+{experiment}", source="experiment")
+            result: Words = {"recording": kept, "diagnosis": answer}
+        except Problem as problem:
+            values = json.loads(json.dumps(problem.values, default=str))
+            result = {"message": {"code": problem.code, "values": values}}
+        store.experiments.judge(experiment, result)
+
+
+def _between(hand: Mapping[str, str], done: Mapping[str, str]) -> float:
+    """Seconds between the end of one record and the beginning of the next, by the clock on the wall.
+
+    Simulated time stands still between runs; where nothing is known it is taken for a moment.
+    """
+    from calib_core.prospect import PAUSE_S
+
+    ended, began = hand.get("finished_at"), done.get("started_at")
+    if not ended or not began or done.get("rig", "").startswith("twin:"):
+        return PAUSE_S
+    return max(PAUSE_S, (datetime.fromisoformat(began) - datetime.fromisoformat(ended)).total_seconds())

@@ -25,6 +25,7 @@ STATUS = {
     "run.busy": 409,
     "run.not_running": 409,
     "rig.busy": 409,
+    "experiment.nothing_open": 409,
     "board.exists": 409,
     "gyro_model.exists": 409,
     "gyro_model.preset": 409,

@@ -12,6 +12,7 @@ from server.settings import data_dir
 from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
+from server.store_experiments import Experiments
 from server.store_recordings import Recordings
 from server.store_rig import RigRecords
 from server.store_runs import Runs
@@ -27,6 +28,7 @@ class Store:
         self.runs = Runs(self.connection)
         self.recordings = Recordings(self.connection)
         self.certificates = Certificates(self.connection)
+        self.experiments = Experiments(self.connection)
         self.rig_records = RigRecords(self.connection)
 
     def recording(self, recording: str) -> Recording:

@@ -67,6 +67,16 @@ def _rig_records(db: Database) -> None:
     db.table("rig_records").create({"id": int, "kind": str, "body": str, "created_at": str}, pk="id")
 
 
+@migrations(name="0003_experiments")
+def _experiments(db: Database) -> None:
+    db.table("experiments").create(
+        {"id": str, "recording": str, "axis": str, "effects": str, "proposal": str, "run": str, "result": str,
+         "created_at": str},
+        pk="id",
+        foreign_keys=[("recording", "recordings", "id")],
+    )  # fmt: skip
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

@@ -9,6 +9,7 @@ from server.store_db import ID_PATTERN, checked_id
 
 Axis = Literal["x", "z"]
 StateName = Literal["estimate_x", "rate_x", "position_x", "estimate_z", "rate_z", "position_z"]
+AnyState = StateName | Literal["experiment"]
 Profile = Literal["standard", "thesis"]
 RunStatus = Literal["queued", "running", "finished", "stopped", "failed", "interrupted"]
 Verdict = Literal["pass", "fail", "issued"]
@@ -158,7 +159,7 @@ class Message(BaseModel):
 
 
 class RunState(BaseModel):
-    name: StateName
+    name: AnyState
     status: Literal["waiting", "running", "done", "failed", "kept"]
     result: dict[str, Any] | None
 
