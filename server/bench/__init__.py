@@ -12,7 +12,7 @@ from calib_core.problem import Problem
 
 SUBJECTS: dict[str, tuple[str, ...]] = {
     "core": ("core", "boards", "parsing", "calibration", "startup"),
-    "bus": ("bus_daq",),
+    "bus": ("bus", "bus_daq"),
     "coverage": ("coverage",),
     "gap": ("gap", "gap_real", "gap_cost", "gap_peers"),
 }
