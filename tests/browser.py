@@ -34,12 +34,12 @@ class Server:
     def __init__(self, url: str) -> None:
         self.url = url
 
-    def call(self, method: str, path: str, body: object = None) -> Any:
+    def call(self, method: str, path: str, body: object = None, *, seconds: float = 30.0) -> Any:
         request = urllib.request.Request(f"{self.url}/api/v1{path}", method=method)
         if body is not None:
             request.add_header("Content-Type", "application/json")
             request.data = json.dumps(body).encode()
-        with urllib.request.urlopen(request, timeout=30) as answer:
+        with urllib.request.urlopen(request, timeout=seconds) as answer:
             content = answer.read()
         return json.loads(content) if content else None
 

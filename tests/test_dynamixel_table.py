@@ -130,10 +130,12 @@ def test_a_servo_that_is_set_up_wrongly_is_named(
     before = servos.bus.peek(2, address, len(values))
     servos.bus.poke(2, address, *values)
     with closing(servos.table()) as table:
-        with pytest.raises(DeviceError) as found:
-            table.open()
+        try:
+            with pytest.raises(DeviceError) as found:
+                table.open()
+        finally:  # the other tests have the same servos
+            servos.bus.poke(2, address, *before)
         assert (found.value.code, found.value.values["axis"]) == (code, "z")
-        servos.bus.poke(2, address, *before)
         table.open()  # mended, it works
 
 

@@ -32,7 +32,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
 def test_it_answers_soon_and_its_own_start_is_cheap(tmp_path: Path) -> None:
     """Issue 2: within 3 s, and at most 1.4 times the CPU of importing fastapi and numpy, which it cannot do without.
 
-    CPU is compared with a second process beside it; the limits here leave room for a busy machine.
+    Both are compared with a second process beside it, which a busy machine makes as slow.
     """
     began = time.monotonic()
     running = Server(tmp_path)
@@ -43,8 +43,10 @@ def test_it_answers_soon_and_its_own_start_is_cheap(tmp_path: Path) -> None:
     finally:
         running.close()
     script = "import fastapi, numpy, psutil; t = psutil.Process().cpu_times(); print(t.user + t.system)"
+    began = time.monotonic()
     least = float(subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout)
-    assert took < 6
+    beside = time.monotonic() - began
+    assert took < max(3.0, 4.0 * beside)
     assert times.user + times.system < 1.8 * least
 
 
