@@ -39,6 +39,8 @@ def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip 
     """The limits that the output of ``axis`` seems to stop at, or None; ``noise`` is one sample's deviation."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+    if not design.moves:
+        return None
     s = design.averages.samples
     rate = encoder_rate(recording, axis, design, SMOOTH_S)
     middle, reach = float(np.median(s.output)), float(np.ptp(s.output)) / 2.0
