@@ -74,12 +74,21 @@ def _end_with_parent() -> None:
 
 
 def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, str] | None, board: str | None) -> str:
-    """Reads and keeps an uploaded recording; gives its id. Raises Problem as `calib_core.recording.read`."""
+    """Reads and keeps an uploaded recording or file of points; gives its id. Raises Problem as their `read`."""
+    from calib_core import points
     from calib_core.recording import read
     from server.store import Store
 
     with file.open("rb") as opened:
-        recording = read(opened, name=name, mapping=mapping)
+        try:
+            recording = read(opened, name=name, mapping=mapping)
+        except Problem as problem:
+            if problem.code != "recording.is_points":
+                raise
+            opened.seek(0)
+            readings = points.read(opened, mapping=mapping)
+            with Store(data) as store:
+                return store.recordings.add_points(readings, board=board or "", name=name)
     board = board or recording.header.get("board", "")
     with Store(data) as store:
         if board:
@@ -89,10 +98,15 @@ def import_recording(data: Path, file: Path, name: str, mapping: Mapping[str, st
 
 def export_recording(data: Path, recording: str, form: str, file: Path) -> None:
     """Writes "csv", "parquet" or "fast.csv" of a stored recording to ``file``."""
+    from calib_core import points
     from calib_core.recording import write_csv, write_parquet
     from server.store import Store
 
     with Store(data) as store, file.open("wb") as opened:
+        readings = store.recordings.points(recording) if form == "csv" else None
+        if readings is not None:
+            points.write(readings, opened)
+            return
         loaded = store.recordings.load(recording, kind="fast" if form == "fast.csv" else "rows")
         (write_parquet if form == "parquet" else write_csv)(loaded, opened)
 
@@ -126,12 +140,18 @@ def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, An
         return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec))
 
 
-def diagnose(data: Path, recording: str, axis: str | None, effects: Sequence[str]) -> dict[str, Any]:
+def diagnose(
+    data: Path, recording: str, axis: str | None, effects: Sequence[str], board: str | None = None
+) -> dict[str, Any]:
+    """CONTRACT 3 of a stored recording; of points, of the first board and axis that are meant."""
     from server import diagnosis
     from server.store import Store
 
     with Store(data) as store:
         row = store.recordings.row(recording)
+        readings = store.recordings.points(recording)
+        if readings is not None:
+            return diagnosis.of_points(readings, axis=axis, effects=effects, file=row["name"], board=board)[0]
         return diagnosis.of_recording(store.recording(recording), axis=axis, effects=effects, file=row["name"])
 
 

@@ -5,7 +5,7 @@ numbers, codes and values, the same in every language; the second adds their sen
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from server.texts import render, texts
 
 if TYPE_CHECKING:
     from calib_core.effects import Effect
+    from calib_core.points import Points
     from calib_core.recording import Recording
 
 Words = dict[str, Any]
@@ -21,6 +22,8 @@ Words = dict[str, Any]
 CERTAIN, LIKELY = 1e-6, 1e-3
 """Chances that noise alone gives a finding, over all effects tried."""
 ABOVE_FLOOR = 1.1
+STANDS_OUT = 10.0
+"""2ΔlnL by which one effect of a few stands out from noise."""
 STILL = {"rate": 0.5, "acceleration": 0.5, "other_rate": 0.5}
 """Below this a covariate is said to stand still."""
 KINDS = {
@@ -33,11 +36,44 @@ KINDS = {
 
 
 def of_file(file: Path, *, axis: str | None = None, effects: Sequence[str] = ()) -> list[Words]:
-    """The diagnosis of a recording's file. Raises Problem and OSError."""
-    from calib_core import recording
+    """The diagnosis of a recording, or of every board and axis of a file of points. Raises Problem and OSError."""
+    from calib_core import points, recording
 
     with file.open("rb") as opened:
-        return [of_recording(recording.read(opened, name=file.name), axis=axis, effects=effects, file=file.name)]
+        try:
+            found = recording.read(opened, name=file.name)
+        except Problem as problem:
+            if problem.code != "recording.is_points":
+                raise
+            opened.seek(0)
+            return of_points(points.read(opened), axis=axis, effects=effects, file=file.name)
+    return [of_recording(found, axis=axis, effects=effects, file=file.name)]
+
+
+def of_points(
+    points: "Points",
+    *,
+    axis: str | None = None,
+    effects: Sequence[str] = (),
+    file: str | None = None,
+    board: str | None = None,
+) -> list[Words]:
+    """CONTRACT 3 for each board and axis, in the order of the file; only ``board`` and ``axis`` where given."""
+    from calib_core.effects import library
+    from calib_core.gap_points import diagnose
+
+    _known(effects, library())
+    groups = dict.fromkeys(zip(points.board.tolist(), points.axis.tolist(), strict=True))
+    if board is not None and board not in {b for b, _ in groups}:
+        raise Problem("diagnosis.no_board", board=board, boards=", ".join(dict.fromkeys(b for b, _ in groups)))
+    groups = {(b, a): None for b, a in groups if board in (None, b)}
+    chosen = [(b, a) for b, a in groups if axis in (None, a)]
+    if not chosen:
+        raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(sorted({a for _, a in groups})))
+    answers = [diagnose(points.take((points.board == b) & (points.axis == a)), effects=effects) for b, a in chosen]
+    for answer in answers:
+        answer["recording"]["file"] = file
+    return [explained(answer) for answer in answers]
 
 
 def of_recording(
@@ -54,9 +90,7 @@ def of_recording(
     from calib_core.gap_report import to_json
 
     pool = dict(library() if suspects is None else suspects)
-    for name in effects:
-        if name not in pool:
-            raise Problem("diagnosis.no_such_effect", given=name, allowed=", ".join(pool))
+    _known(effects, pool)
     if axis is not None and axis not in recording.axes:
         raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(recording.axes))
     named = recording.header.get("axis", "")
@@ -64,6 +98,12 @@ def of_recording(
     answer = to_json(diagnose(recording, axis, effects=effects, suspects=pool))
     answer["recording"]["file"] = file
     return explained(answer)
+
+
+def _known(effects: Sequence[str], pool: Iterable[str]) -> None:
+    for name in effects:
+        if name not in pool:
+            raise Problem("diagnosis.no_such_effect", given=name, allowed=", ".join(pool))
 
 
 def explained(answer: Words) -> Words:
@@ -105,12 +145,15 @@ def told(answer: Words, lang: str) -> Words:
 def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
     """The code and values of the one plain sentence."""
     before, after, floor, unit = errors(answer)
-    findings = [effect_words(tied.get(m["effect"], [m["effect"]])) for m in answer["missing"]]
-    values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": _joined("both", findings)}
     verdict = answer["verdict"]
+    joint = "bracketed" if verdict == "ambiguous" and len(answer["missing"]) > 1 else "either"
+    findings = [effect_words(tied.get(m["effect"], [m["effect"]]), joint) for m in answer["missing"]]
+    values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": _joined("both", findings)}
     if verdict == "unknown":
         values["along"] = along(answer["unknown"]["covariate"])
         verdict = "unknown_beside" if findings else "unknown"
+    elif joint == "bracketed":
+        verdict = "ambiguous_several"
     elif verdict == "adequate" and before > ABOVE_FLOOR * floor:
         verdict = "adequate_above_floor"
     return {"code": f"diagnosis.{verdict}", "values": values}
@@ -135,6 +178,8 @@ def _failure(failure: Mapping[str, Any]) -> Words:
     kind = place.pop("kind")
     if max(abs(low), abs(high)) < STILL.get(kind, 0.0):
         kind = "other_still" if kind == "other_rate" else "still"
+    elif low == high and kind in ("rate", "position"):
+        kind = f"{kind}_at"
     where = {"code": f"diagnosis.where.{kind}", "values": ends | place}
     size = rounded(float(f"{abs(residual):.2g}"), abs(residual / z) if z else 0.0)
     side = "reads_low" if residual > 0.0 else "reads_high"
@@ -160,7 +205,16 @@ def _limits(answer: Words) -> Iterator[Words]:
         yield limit("unknown")
     if answer["code"] == "diagnosis.adequate_above_floor":
         yield limit("above_floor")
-    for status in ("not_excited", "no_data"):
+    timed = answer["recording"]["duration_s"] is not None
+    if not timed:
+        if "bias_step" in [m["effect"] for m in answer["missing"]]:
+            yield limit("moved")
+        names = [m["effect"] for m in answer["missing"] if m["two_delta_lnL_by_set_point"] < STANDS_OUT]
+        if names:
+            yield limit("common_error", effects=effect_words(names, "both"))
+        yield limit("reference")
+        yield limit("no_time")
+    for status in ("not_excited", "no_data") if timed else ("not_excited",):
         names = [c["effect"] for c in answer["candidates"] if c["status"] == status]
         if names:
             yield limit(status, effects=[effect_word(name) for name in names])

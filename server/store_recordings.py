@@ -1,11 +1,15 @@
 """Recordings as compact blocks: appended as they are measured, one block a state once it has ended."""
 
+import hashlib
+import io
 import json
 import secrets
+import zlib
 from collections.abc import Collection, Mapping
 from typing import Any
 
 from calib_core.packing import pack_recording, unpack_recording
+from calib_core.points import FORMAT, Points, read, write
 from calib_core.problem import Problem
 from calib_core.recording import Recording
 from server.store_db import Connection, Row, dumps, like, now, page
@@ -35,6 +39,24 @@ class Recordings:
             self.append(recording, whole, state="", live=False)
             self.seal(recording, whole)
         return recording
+
+    def add_points(self, points: Points, *, board: str, name: str) -> str:
+        """Independent readings (``gyro-points 1``), kept as the text that they are written as."""
+        text = io.BytesIO()
+        write(points, text)
+        raw = text.getvalue()
+        with self._at.write() as db:
+            recording = self.create(board=board, name=name, source="upload", header={"format": FORMAT})
+            block = {"recording": recording, "kind": "points", "state": "", "live": 0, "samples": len(points)}
+            db.table("blocks").insert({**block, "end_s": 0.0, "data": zlib.compress(raw)})
+            facts = {"digest": hashlib.sha256(raw).hexdigest(), "samples": len(points)}
+            db.table("recordings").update(recording, facts)
+        return recording
+
+    def points(self, recording: str) -> Points | None:
+        """The readings of ``add_points``; None where it is a recording in time."""
+        found = self._at.rows("select data from blocks where recording = ? and kind = 'points'", [recording])
+        return read(zlib.decompress(found[0]["data"])) if found else None
 
     def append(self, recording: str, rows: Recording, *, state: str, kind: str = "rows", live: bool = True) -> None:
         """A block of rows after the last; ``kind`` "fast" holds the 1 kHz file's."""
@@ -117,6 +139,8 @@ class Recordings:
         if state is not None:
             sql, values = f"{sql} and state = ?", [*values, state]
         blocks = self._at.rows(f"{sql} order by id", values)
+        if not blocks and header.get("format") == FORMAT:
+            raise Problem("recording.is_points")
         if not blocks:
             raise Problem("recording.empty", recording=recording, state=state or "")
         joined = Recording.join([unpack_recording(row["data"]) for row in blocks])

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 from running import Server
+from shared import ROOT
 
+from calib_core import points
 from calib_core.recording import write_csv
 from server import cli, diagnosis
 from server.bench.gap_campaign import as_recording
@@ -191,6 +193,21 @@ def test_the_api_gives_what_the_command_gives(server: Server, file: Path, capsys
     refused = server.client.post(f"/recordings/{recording}/diagnosis", json={"effects": ["magic"]})
     assert (refused.status_code, refused.json()["code"]) == (422, "diagnosis.no_such_effect")
     assert server.client.post("/recordings/none/diagnosis", json={}).status_code == 404
+
+
+def test_the_api_keeps_points_and_diagnoses_one_board_and_axis(server: Server) -> None:
+    shipped = (ROOT / "calib_core" / "thesis" / "data" / "position.csv").read_bytes()
+    kept = server.client.post("/recordings", files={"file": ("position.csv", shipped)}).json()
+    assert (kept["header"]["format"], kept["samples"]) == ("gyro-points 1", 992)
+    where = f"/recordings/{kept['id']}"
+    again = points.read(server.client.get(f"{where}.csv").content)
+    assert again.gyro.tolist() == points.read(shipped).gyro.tolist()
+    said = server.client.post(f"{where}/diagnosis", json={"board": "2", "axis": "x"}).json()
+    assert {"bias_step", "scale_factor_asymmetry"} <= set(said["rivals"][0])
+    assert "held_out_rms_deg" in said["error"]
+    refused = server.client.post(f"{where}/diagnosis", json={"board": "3"})
+    assert (refused.status_code, refused.json()["code"]) == (422, "diagnosis.no_board")
+    assert server.client.post("/certificates", json={"recording": kept["id"]}).json()["code"] == "recording.is_points"
 
 
 def test_the_api_tells_of_every_effect_in_the_language_asked_for(server: Server) -> None:

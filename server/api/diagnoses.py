@@ -18,6 +18,7 @@ EffectName = Annotated[str, Field(min_length=1, max_length=64)]
 class DiagnosisBody(Body):
     axis: Literal["x", "y", "z"] | None = Field(None, description="the recording's own where it is left out")
     effects: list[EffectName] = Field([], max_length=30, description="effects that the model already has")
+    board: str | None = Field(None, max_length=64, description="of points: whose readings, where there are several")
 
 
 class Said(Answer):
@@ -96,7 +97,7 @@ class Effects(BaseModel):
 )
 async def diagnose(recording: str, body: DiagnosisBody, here: Here, lang: Language) -> Diagnosis:
     answer = await here.compute.run(
-        compute.diagnose, here.store.data, recording, body.axis, tuple(dict.fromkeys(body.effects))
+        compute.diagnose, here.store.data, recording, body.axis, tuple(dict.fromkeys(body.effects)), body.board
     )
     return Diagnosis.model_validate(diagnosis.told(answer, lang))
 

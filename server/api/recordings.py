@@ -35,7 +35,7 @@ def recordings(
 @router.post(
     "",
     status_code=201,
-    summary="Keep a recording: gyro-recording 1 as CSV, .csv.gz or Parquet",
+    summary="Keep a recording: gyro-recording 1 as CSV, .csv.gz or Parquet, or gyro-points 1 as CSV",
     responses=declared(400, 413),
 )
 async def upload(
