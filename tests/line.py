@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import select
 import tempfile
 import threading
 import time
@@ -37,11 +38,14 @@ class Line:
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         Path(self.port).symlink_to(os.ttyname(self._slave))
-        self._thread = threading.Thread(target=self._talk, args=[self._master], daemon=True)
+        end, self._end = os.pipe()
+        self._thread = threading.Thread(target=self._talk, args=[self._master, end], daemon=True)
         self._thread.start()
 
     def unplug(self) -> None:
         Path(self.port).unlink()
+        os.close(self._end)
+        self._thread.join()  # its descriptors' numbers are the next line's: it must not read on
         for fd in (self._slave, self._master):
             os.close(fd)
 
@@ -49,13 +53,14 @@ class Line:
         """Answers for the packets to come."""
         self._answers = list(answers)
 
-    def _talk(self, master: int) -> None:
+    def _talk(self, master: int, end: int) -> None:
         heard = b""
         while True:
-            try:
-                heard += os.read(master, 256)
-            except OSError:
+            ready, _, _ = select.select([master, end], [], [])
+            if end in ready:
+                os.close(end)
                 return
+            heard += os.read(master, 256)
             while len(heard) >= 4 and len(heard) >= heard[3] + 4:
                 self.asked.append(heard[: heard[3] + 4])
                 heard = heard[heard[3] + 4 :]
@@ -66,7 +71,7 @@ class Line:
                         os.write(master, data)
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):
+        if Path(self.port).is_symlink():
             self.unplug()
         self._folder.cleanup()
 
