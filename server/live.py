@@ -92,8 +92,14 @@ class LiveRun:
         if latest is None:
             return
         for clock, chunks in self._chunks.items():
-            while clock.endswith(".time_s") and chunks and not chunks[0][1][clock][-1] > latest - WINDOW_S:
+            if not clock.endswith(".time_s"):
+                continue
+            while chunks and not chunks[0][1][clock][-1] > latest - WINDOW_S:
                 self._dropped = max(self._dropped, chunks.popleft()[0])
+            if chunks and chunks[0][1][clock][0] < latest - WINDOW_S:  # at full speed a frame can be minutes long
+                seq, oldest = chunks[0]
+                inside = oldest[clock] >= latest - WINDOW_S
+                chunks[0] = seq, {name: values[inside] for name, values in oldest.items()}
 
     def since(self, cursor: int | None, lang: str = "en") -> tuple[bytes, int] | None:
         """What is newer than the cursor, and the next cursor; None where nothing is. Without a cursor: all of it.

@@ -229,6 +229,7 @@ def test_a_full_disk_is_told_in_one_sentence(
 def test_ctrl_c_stops_the_run_keeps_its_samples_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what starts the tests may have it ignored
     compact = Recordings.compact
     monkeypatch.setattr(Recordings, "compact", lambda *a: (signal.raise_signal(signal.SIGINT), compact(*a))[1])
     words = ["calibrate", "--board", "S", "--readings", "3", "--data", str(tmp_path), "--out", str(tmp_path), "--json"]

@@ -11,7 +11,7 @@ import pytest
 from running import Server
 from websockets.sync.client import ClientConnection, connect
 
-from server.live import LiveRun, decode, encode
+from server.live import WINDOW_S, LiveRun, decode, encode
 
 
 def frame(start_s: float, seconds: float = 1.0) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def test_a_viewer_gets_each_sample_once_and_a_late_one_all_that_is_kept() -> Non
     assert np.allclose(np.diff(seen), 0.02)
     late, arrays = decode(live.since(None)[0])  # type: ignore[index]
     assert late["points"] == list(range(200))
-    assert 120 <= np.ptp(arrays["x.time_s"]) < 122
+    assert WINDOW_S - 0.03 < np.ptp(arrays["x.time_s"]) <= WINDOW_S
 
 
 def test_a_viewer_who_fell_behind_the_window_starts_again() -> None:

@@ -1,9 +1,11 @@
 """The DAQ driver on the emulated NI gRPC server: exact samples, and a sentence for whatever fails."""
 
+import gc
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -304,17 +306,18 @@ def test_memory_stays_flat_over_a_long_reading(ni: Bench) -> None:
     import tracemalloc
 
     daq = ni.running()
+    held = []
     tracemalloc.start()
     try:
-        for _ in range(50):
-            daq.read(100)
-        before, _ = tracemalloc.get_traced_memory()
-        for _ in range(100):
-            daq.read(100)
-        after, _ = tracemalloc.get_traced_memory()
+        for _ in range(4):
+            for _ in range(50):
+                daq.read(100)
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert after - before < 20_000
+    # gRPC's own threads let go when they come to it; what is kept of each reading would grow every time.
+    assert min(after - before for before, after in pairwise(held)) < 5_000
 
 
 def test_nis_library_is_not_imported_before_it_is_needed() -> None:

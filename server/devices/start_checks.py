@@ -224,8 +224,14 @@ class _Bench:
 
     def home(self) -> None:
         """All axes to 0°, slowly, from wherever they are."""
-        rows = self.go((), 2 * BLOCK_S)
-        away = max(abs(float(np.nanmean(rows[f"{axis}_position_deg"]))) for axis in self.rig.axes)
+        at_deg: dict[str, float] = {}
+        while len(at_deg) < len(self.rig.axes):  # the rig itself ends it where a servo stays silent
+            rows = self.go((), 2 * BLOCK_S)
+            for axis in self.rig.axes:
+                angle = rows[f"{axis}_position_deg"]
+                if np.isfinite(angle).any():
+                    at_deg[axis] = float(angle[np.isfinite(angle)][-1])
+        away = max(map(abs, at_deg.values()))
         moves = tuple(Move(axis, 0.0, SWING_DPS) for axis in self.rig.axes)
         self.go(moves, away / SWING_DPS + SETTLE_S)
 
@@ -238,6 +244,8 @@ class _Bench:
             rows = self.go(motions, turning_s + REST_S)
             n = len(rows["time_s"])
             still = np.arange(n) >= n - round(REST_S / ROW_S)
+            if np.isnan(rows[f"{axis}_position_deg"][still]).all():
+                raise DeviceError("rig.servo_silent", axis=axis, part=self.rig.axes[axis].part)
             parts.append(rows | {"stroke": np.full(n, float(stroke)), "still": still.astype(float)})
             at_deg = to_deg
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
