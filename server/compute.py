@@ -177,3 +177,12 @@ def thesis() -> dict[str, Any]:
     from calib_core.thesis import report
 
     return dict(report())
+
+
+def notebook(data: Path, notebook: str, lang: str) -> bytes:
+    """A lab notebook as PDF."""
+    from server.documents.notebook import render_notebook
+    from server.store import Store
+
+    with Store(data) as store:
+        return bytes(render_notebook(store.notebooks.get(notebook), store.notebooks.lines(notebook), lang))

@@ -26,6 +26,7 @@ STATUS = {
     "run.not_running": 409,
     "rig.busy": 409,
     "experiment.nothing_open": 409,
+    "notebook.full": 409,
     "board.exists": 409,
     "gyro_model.exists": 409,
     "gyro_model.preset": 409,

@@ -13,6 +13,7 @@ from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
 from server.store_experiments import Experiments
+from server.store_notebooks import Notebooks
 from server.store_recordings import Recordings
 from server.store_rig import RigRecords
 from server.store_runs import Runs
@@ -30,6 +31,7 @@ class Store:
         self.certificates = Certificates(self.connection)
         self.experiments = Experiments(self.connection)
         self.rig_records = RigRecords(self.connection)
+        self.notebooks = Notebooks(self.connection)
 
     def recording(self, recording: str) -> Recording:
         return self.recordings.load(recording)

@@ -77,6 +77,21 @@ def _experiments(db: Database) -> None:
     )  # fmt: skip
 
 
+@migrations(name="0004_notebooks")
+def _notebooks(db: Database) -> None:
+    db.table("notebooks").create({"id": str, "title": str, "author": str, "lab": str, "created_at": str}, pk="id")
+    db.table("notebook_lines").create(
+        {"notebook": str, "n": int, "at": str, "step": str, "body": str},
+        pk=("notebook", "n"),
+        foreign_keys=[("notebook", "notebooks", "id")],
+    )
+    for verb in ("update", "delete"):
+        db.execute(
+            f"create trigger notebook_lines_no_{verb} before {verb} on notebook_lines "
+            "begin select raise(abort, 'a line of a notebook is never changed'); end"
+        )
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

@@ -8,6 +8,7 @@ from server.api import (
     gyro_models,
     health,
     live,
+    notebooks,
     recordings,
     rig,
     runs,
@@ -24,6 +25,7 @@ ROUTERS = (
     recordings.router,
     diagnoses.router,
     experiments.router,
+    notebooks.router,
     certificates.router,
     thesis.router,
 )

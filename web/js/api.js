@@ -114,6 +114,10 @@ export const api = {
   },
   verify: (number) => call("GET", `/certificates/${id(number)}/verify`),
 
+  beginNotebook: (body) => call("POST", "/notebooks", body),
+  notebook: (notebook) => call("GET", `/notebooks/${id(notebook)}`),
+  writeNotebook: (notebook, line) => call("POST", `/notebooks/${id(notebook)}/lines`, line),
+
   thesis: () => call("GET", "/thesis"),
   useToken: (token) => localStorage.setItem(TOKEN, token),
 };
@@ -122,6 +126,7 @@ export const links = {
   live: (run) => `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${ROOT}/runs/${id(run)}/live${query({ lang: language })}`,
   recording: (recording, kind = "csv") => `${ROOT}/recordings/${id(recording)}.${kind}`,
   document: (number, kind) => `${ROOT}/certificates/${id(number)}.${kind}${kind === "pdf" ? query({ lang: language }) : ""}`,
+  notebook: (notebook) => `${ROOT}/notebooks/${id(notebook)}.pdf${query({ lang: language })}`,
   run: (run) => `/run.html${query({ id: run })}`,
   board: (board) => `/boards.html${query({ id: board })}`,
   compare: (a, b) => `/compare.html${query({ a, b })}`,
