@@ -22,14 +22,13 @@ from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_unknown import CERTAIN, Structure, structures
 from calib_core.integral_fit import Design
-from calib_core.noise_fit import first_guess
 from calib_core.problem import Problem
 from calib_core.recording import Recording
 
 F64 = NDArray[np.float64]
 
-TOLERATED = 0.003
-"""So much better may the error without an effect be: a small effect's gain drowns in the windows' own scatter."""
+AGREED = 2.0
+"""Of χ² on data not seen, what an effect must take away."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
 """Effects that are no shape in the residual: each has a test of its own, or can have none."""
 
@@ -102,6 +101,19 @@ def named(search: Search) -> list[Term]:
     return [t for t in search.chosen if t.name != "unknown"]
 
 
+def prepare(recording: Recording, axis: str, mask: NDArray[np.bool_] | None = None) -> Space:
+    """The space of the rows in ``mask`` (of the recording), about its base."""
+    design = Design.of(recording, axis, mask)
+    rough = design.rough()
+    scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")
+    c = covariates.of(recording, axis, design, float(rough[0]), scale_factor)
+    space = Space(design, c, rough)
+    # The base is now known well: the covariates, and the space about them, once more.
+    if len(space.values) > 1:
+        space = Space(design, covariates.of(recording, axis, design, *space.values.tolist()), space.values)
+    return space
+
+
 def _search(
     recording: Recording,
     axis: str,
@@ -111,19 +123,13 @@ def _search(
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Space, Search]:
     """The space of the recording, and a search of it that has the asked effects in its model."""
-    design = Design.of(recording, axis, mask)
-    rough = design.rough()
-    scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")
-    c = covariates.of(recording, axis, design, float(rough[0]), scale_factor)
-    space = Space(design, c, rough)
-    # The base is now known well: the covariates, and the space about them, once more.
-    if len(space.values) > 1:
-        space = Space(design, covariates.of(recording, axis, design, *space.values.tolist()), space.values)
+    space = prepare(recording, axis, mask)
+    c = space.covariates
     shaped = {n: e for n, e in pool.items() if n not in BY_ITSELF and not e.missing(c)}
     search = Search(space, shaped, rng)
     if effects:
         first = [next((t for t in search.terms() if t.name == name), None) or _refuse(name) for name in effects]
-        search = Search(space, shaped, rng, chosen=first)
+        search = Search(space, shaped, rng, chosen=first, columns=search.columns)
         search.settle()
     return space, search
 
@@ -142,7 +148,7 @@ def _clipped(
     rng: np.random.Generator,
 ) -> tuple[Space, Search]:
     """The space without the samples on a limit, where that explains the record better than any other effect."""
-    clip = gap_saturation.find(recording, answer.axis, space.design, first_guess(space.design.rows, space.residual))
+    clip = gap_saturation.find(recording, answer.axis, space.design, space.rough_noise)
     if clip is None:
         return space, search
     kept, without = _search(recording, answer.axis, pool, effects, rng, ~clip.clipped)
@@ -150,7 +156,7 @@ def _clipped(
     everything = search.chi2(search.chosen)
     _, ranking = search.scan()
     other = min((search.refined(s.term, search.chosen)[1] for s in ranking[:3]), default=everything)
-    inside = len(space.design.rows) - len(kept.design.rows)
+    inside = len(space.rows) - len(kept.rows)
     clipped = without.chi2(without.chosen) + inside
     if clipped > other:
         return space, search
@@ -161,15 +167,15 @@ def _clipped(
 def _agree(search: Search) -> None:
     """Drops what does not lower the error on data not seen, however sure it looks where it was fitted."""
     while len(search.chosen) > search.given:
-        now = Explanation(search.space, search.chosen).error().held_out_rms_dps
-        less = {
-            k: Explanation(search.space, [*search.chosen[:k], *search.chosen[k + 1 :]]).error().held_out_rms_dps
+        now = search.held_out(search.chosen)
+        gains = [
+            search.held_out([*search.chosen[:k], *search.chosen[k + 1 :]]) - now
             for k in range(search.given, len(search.chosen))
-        }
-        worst = min(less, key=less.__getitem__)
-        if less[worst] >= now * (1.0 - TOLERATED):
+        ]
+        worst = int(np.argmin(gains))
+        if gains[worst] > AGREED:
             return
-        del search.chosen[worst], search.findings[worst - search.given]
+        del search.chosen[search.given + worst], search.findings[worst]
 
 
 def _structure(answer: Diagnosis, search: Search) -> None:
@@ -181,7 +187,8 @@ def _structure(answer: Diagnosis, search: Search) -> None:
     answer.unknown = found[0]
     names = {t.name for t in search.chosen[search.given :]}
     asked = search.chosen[: search.given]
-    beside = Search(search.space, {n: e for n, e in search.suspects.items() if n in names}, search.rng)
+    few = {n: e for n, e in search.suspects.items() if n in names}
+    beside = Search(search.space, few, search.rng, columns=search.columns)
     beside.chosen = [*asked, found[0].term]
     beside.given = len(beside.chosen)
     beside.run()

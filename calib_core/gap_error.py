@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects.base import Acts
-from calib_core.gap_space import Gram, Space, Term
+from calib_core.gap_gram import Gram
+from calib_core.gap_space import Space, Term
+from calib_core.integral_fit import SUFFIX
 from calib_core.weak_form import Windows
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-BLOCKS = 8
 BINS = 14
 
 
@@ -44,7 +45,8 @@ class Failure:
 class Explanation:
     """Base and terms fitted with each block of time left out in turn; residuals of windows in deg/s."""
 
-    def __init__(self, space: Space, terms: Sequence[Term]) -> None:
+    def __init__(self, space: Space, terms: Sequence[Term], fixed: Mapping[str, float] | None = None) -> None:
+        """Parameters in ``fixed``, by full name, keep the value given there."""
         self.space, self.terms = space, terms
         design, c = space.design, space.covariates
         samples = design.averages.samples
@@ -62,9 +64,10 @@ class Explanation:
             [windows.mean(np.column_stack(base)), windows.mean(rate_shapes) + windows.rate(angle_shapes)]
         )[self.first]
         self.measured = (windows.mean(output[:, None]) - truth)[self.first, 0]
-        self.middle_s = samples.time_s[windows.first[self.first] + windows.width // 2] - samples.time_s[0]
-        self.gram = space.gram(terms)
-        self._free = self._coefficient_places()
+        self.middle_s: F64 = samples.time_s[windows.first[self.first] + windows.width // 2] - samples.time_s[0]
+        self.gram = space.gram(terms, folds=True)
+        self._known = self._granted(fixed or {})
+        self._free = [k for k in range(1 + self.gram.base, len(self.gram.scale)) if k not in self._known]
 
     def _whole(self, windows: Windows) -> Ints:
         """The windows in which the record is not interrupted."""
@@ -87,51 +90,69 @@ class Explanation:
             at = part.stop
         return rates, angles
 
-    def _coefficient_places(self) -> list[int]:
-        places: list[int] = []
-        at = 1 + self.gram.base
-        for term in self.terms:
-            if not term.fixed:
-                places += range(at, at + term.columns.shape[1])
-            at += term.columns.shape[1]
-        return places
+    @property
+    def names(self) -> list[str]:
+        """Full names of bias, scale factor and the linear parameters, column by column; "" for what has none."""
+        suffix = SUFFIX[self.space.design.averages.samples.unit]
+        base = [f"bias_{suffix}", f"scale_factor_{suffix}_per_dps"][: len(self.space.values)]
+        base += [""] * (self.gram.base - len(base))
+        return base + [f"{t.name}.{name}" if name else "" for t in self.terms for name in t.names]
+
+    def _granted(self, fixed: Mapping[str, float]) -> dict[int, float]:
+        """Coefficients that are not estimated, by their column in the Gram matrix: one where the size is a setting."""
+        known = {k: fixed[name] for k, name in enumerate(self.names, 1) if name in fixed}
+        known |= {k: known[k] - float(self.space.values[k - 1]) for k in known if k <= len(self.space.values)}
+        return known | {k: 1.0 for k, name in enumerate(self.names, 1) if not name and k > self.gram.base}
 
     def residual(self, coefficients: F64) -> F64:
         """(w,) of the windows, for the coefficients of the base's corrections and the terms."""
         return np.asarray(self.measured - self.columns @ coefficients)
 
-    def coefficients(self, gram: Gram) -> F64:
-        """Of base and terms, one for those whose size is their setting."""
-        return self.solution(gram)[0]
-
-    def solution(self, gram: Gram | None = None) -> tuple[F64, F64]:
-        """Coefficients (p,) of base and terms and their covariance (p, p); a size that is a setting is one, exactly."""
-        gram = gram or self.gram
-        fixed = [k for k in range(1 + gram.base, gram.matrix.shape[0]) if k not in self._free]
-        if fixed:
-            left = gram.white[:, [0]] - gram.white[:, fixed].sum(axis=1, keepdims=True)
-            gram = Gram(np.column_stack([left, gram.white[:, 1:]]), gram.base)
-        p = gram.matrix.shape[0] - 1
-        estimated = [*range(gram.base), *(k - 1 for k in self._free)]
-        values, covariance = np.ones(p), np.zeros((p, p))
-        values[estimated], covariance[np.ix_(estimated, estimated)] = gram.coefficients(self._free)
+    @cached_property
+    def solution(self) -> tuple[F64, F64]:
+        """Coefficients (p,) of base and terms and their covariance (p, p), which is nothing where they are known."""
+        values, covariance = self._given(1)[0], np.zeros((self.columns.shape[1],) * 2)
+        estimated = self._estimated
+        found, spread = self._open.coefficients(self._free)
+        values[estimated] += found
+        covariance[np.ix_(estimated, estimated)] = spread
         return values, covariance
+
+    @property
+    def chi2(self) -> float:
+        """Of the record under this model."""
+        return self._open.chi2(self._free)
+
+    @property
+    def granted(self) -> set[str]:
+        """Names of the parameters that were not estimated."""
+        return {self.names[k - 1] for k in self._known}
+
+    @cached_property
+    def _open(self) -> Gram:
+        """Without what is known."""
+        return self.gram.known(self._known) if self._known else self.gram
+
+    @property
+    def _estimated(self) -> list[int]:
+        return [*range(self.gram.base), *(k - 1 for k in self._free)]
+
+    def _given(self, count: int) -> F64:
+        """(count, p) coefficients before anything is estimated."""
+        values = np.zeros((count, self.columns.shape[1]))
+        for k, value in self._known.items():
+            values[:, k - 1] = value
+        return values
 
     def error(self) -> Error:
         """Cross-validated over blocks of time."""
-        rows_s = self.space.design.rows.time_s - self.space.design.averages.samples.time_s[0]
-        end = float(self.middle_s[-1]) + 1e-9
-        blocks = int(np.clip(end // 5.0, 2, BLOCKS))
-        edges = np.linspace(0.0, end, blocks + 1)
-        squares = 0.0
-        for a, b in pairwise(edges.tolist()):
-            unseen = (self.middle_s >= a) & (self.middle_s < b)
-            if unseen.any():
-                known = np.ones(len(self.space.prior), bool)
-                kept = Gram(self.gram.white[np.append((rows_s < a) | (rows_s >= b), known)], self.gram.base)
-                squares += float(np.sum(self.residual(self.coefficients(kept))[unseen] ** 2))
+        folds = self.space.folds
+        values = self._given(len(folds))
+        values[:, self._estimated] += self._open.left_out(self._free)[1]
+        unseen = values[folds.of_time(self.middle_s + self.space.design.averages.samples.time_s[0])]
+        left = self.measured - np.einsum("ij,ij->i", self.columns, unseen)
         floor = float(np.sqrt(np.mean(self.spread() ** 2)))
-        return Error(float(np.sqrt(squares / len(self.middle_s))), floor, float(edges[1]), blocks)
+        return Error(float(np.sqrt(np.mean(left**2))), floor, folds.block_s, len(folds.edges) - 1)
 
     def spread(self) -> F64:
         """(w,) what the noise gives each window."""
@@ -144,12 +165,15 @@ class Explanation:
         spread = self.windows.spread(noise.white / scale, noise.ar1 / scale, noise.correlation_time_s, variance)
         return np.asarray(spread[self.first])
 
+    def along(self) -> dict[str, F64]:
+        """What residuals are looked at against, by name: (w,) means over the windows."""
+        return {n: self.windows.mean(v[:, None])[self.first, 0] for n, v in covariate_columns(self.space).items()}
+
     def failures(self) -> list[Failure]:
         """The worst stretch of each covariate, worst first: bins of equal count against the mean of their noise."""
-        residual, spread = self.residual(self.coefficients(self.gram)), self.spread()
+        residual, spread = self.residual(self.solution[0]), self.spread()
         found = []
-        for name, values in covariate_columns(self.space).items():
-            at = self.windows.mean(values[:, None])[self.first, 0]
+        for name, at in self.along().items():
             order = np.argsort(at, kind="stable")
             if np.ptp(at) <= 0.0 or len(order) < 2 * BINS:
                 continue

@@ -119,22 +119,25 @@ def parameters(explanation: Explanation) -> list[dict[str, Any]]:
     space = explanation.space
     unit = space.design.averages.samples.unit
     suffix = SUFFIX[unit]
-    values, covariance = explanation.solution()
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    rows = [_parameter(f"bias_{suffix}", float(space.values[0] + values[0]), unit, float(spread[0]))]
+    values, covariance = explanation.solution
+    known = [name in explanation.granted for name in explanation.names]
+    spread = [
+        None if k else float(v) for k, v in zip(known, np.sqrt(np.maximum(np.diag(covariance), 0.0)), strict=True)
+    ]
+    rows = [_parameter(f"bias_{suffix}", float(space.values[0] + values[0]), unit, spread[0])]
     if len(space.values) > 1:
         name = f"scale_factor_{suffix}_per_dps"
         per = "1" if unit == "deg/s" else f"{unit}/(deg/s)"
-        rows.append(_parameter(name, float(space.values[1] + values[1]), per, float(spread[1])))
+        rows.append(_parameter(name, float(space.values[1] + values[1]), per, spread[1]))
     at = space.base.shape[1]
     for term in explanation.terms:
-        known = term.effect.parameters()
+        own = term.effect.parameters()
         if not term.fixed:
             for k, name in enumerate(term.names):
-                size = (float(values[at + k]), float(spread[at + k]))
-                rows.append(_parameter(f"{term.name}.{name}", size[0], _unit(known[name].unit, unit), size[1]))
+                size = (float(values[at + k]), spread[at + k])
+                rows.append(_parameter(f"{term.name}.{name}", size[0], _unit(own[name].unit, unit), size[1]))
         for name, value in zip(term.effect.nonlinear(), term.setting, strict=False):
-            rows.append(_parameter(f"{term.name}.{name}", value, _unit(known[name].unit, unit), None))
+            rows.append(_parameter(f"{term.name}.{name}", value, _unit(own[name].unit, unit), None))
         at += term.columns.shape[1]
     return rows
 

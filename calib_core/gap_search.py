@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
 
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects.base import Effect
-from calib_core.gap_space import Gram, Space, Term
+from calib_core.gap_gram import Gram
+from calib_core.gap_space import Space, Term
 
 F64 = NDArray[np.float64]
 
@@ -61,7 +62,8 @@ class Search:
     findings: list[Finding] = field(default_factory=list)
     last: list[Suspicion] = field(default_factory=list)
     threshold: float = float("nan")
-    _columns: dict[str, list[Term]] = field(default_factory=dict)
+    columns: dict[str, list[Term]] = field(default_factory=dict)
+    """The grid of each suspect, to be shared with other searches of the same space."""
     given: int = field(init=False)
     """So many of the chosen were there from the start."""
 
@@ -70,11 +72,14 @@ class Search:
 
     def terms(self) -> list[Term]:
         """Every suspect not yet chosen, at every point of its grid."""
+        fresh = [name for name in self.suspects if name not in self.columns]
+        for name in fresh:
+            effect = self.suspects[name]
+            self.columns[name] = [self.space.term(effect, s) for s in settings(effect, self.space)]
+        if fresh:
+            self.space.enlist([t for terms in self.columns.values() for t in terms])
         taken = {t.name for t in self.chosen}
-        for name, effect in self.suspects.items():
-            if name not in self._columns:
-                self._columns[name] = [self.space.term(effect, s) for s in settings(effect, self.space)]
-        return [t for name, terms in self._columns.items() if name not in taken for t in terms]
+        return [t for name in self.suspects if name not in taken for t in self.columns[name]]
 
     def scan(self) -> tuple[Gram, list[Suspicion]]:
         """The best setting of every class over base and chosen, best class first; and the Gram matrix behind it."""
@@ -84,7 +89,7 @@ class Search:
         projected = gram.without([k for place in kept for k in place])
         best: dict[str, Suspicion] = {}
         for term, place in zip(terms, places[len(kept) :], strict=True):
-            gain, sure = gram.gain(projected, place, term)
+            gain, sure = gram.gain(projected, place, term.slack, fixed=term.fixed)
             if not np.isfinite(gain):
                 continue
             if gain < 0.0 or (term.effect.positive and projected[place[0], 0] < 0.0):
@@ -120,26 +125,34 @@ class Search:
         return float(np.quantile(best, 1.0 - FALSE_ALARM))
 
     def chi2(self, terms: Sequence[Term]) -> float:
-        """χ² of the record under base and ``terms``, by a whitening of their own."""
-        gram = self.space.gram(terms)
-        places = _places(terms, gram.base)
-        free = [k for t, p in zip(terms, places, strict=True) if not t.fixed for k in p]
-        if any(t.fixed for t in terms):
-            # The terms whose coefficient is one go to the left-hand side.
-            whole = gram.white[:, [0]] - sum(gram.white[:, p] for t, p in zip(terms, places, strict=True) if t.fixed)
-            gram = Gram(np.column_stack([whole, gram.white[:, 1:]]), gram.base)
-        projected = gram.without(free)
-        return float(projected[0, 0] * gram.scale[0] ** 2)
+        """χ² of the record under base and ``terms``."""
+        gram, free = self._free(terms)
+        return gram.chi2(free)
 
-    def refined(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
-        """``term`` at the best setting of its nonlinear parameters beside ``others``, and the χ² there."""
+    def held_out(self, terms: Sequence[Term]) -> float:
+        """χ² of what base and ``terms`` leave of each fold, fitted to the others."""
+        gram, free = self._free(terms, folds=True)
+        return gram.left_out(free)[0]
+
+    def _free(self, terms: Sequence[Term], *, folds: bool = False) -> tuple[Gram, list[int]]:
+        """The terms' Gram matrix, and which of its columns have a coefficient that is not known to be one."""
+        gram = self.space.gram(terms, folds=folds)
+        places = _places(terms, gram.base)
+        fixed = [k for t, p in zip(terms, places, strict=True) if t.fixed for k in p]
+        free = [k for t, p in zip(terms, places, strict=True) if not t.fixed for k in p]
+        return (gram.known(dict.fromkeys(fixed, 1.0)) if fixed else gram), free
+
+    def refined(self, term: Term, others: Sequence[Term], kept: Collection[str] = ()) -> tuple[Term, float]:
+        """``term`` at the best setting of its nonlinear parameters, but those ``kept``, beside ``others``; the χ²."""
         if term.effect.curvature is not None:
-            return self._refined_late(term, others)
+            return (term, self.chi2([*others, term])) if kept else self._refined_late(term, others)
         from scipy.optimize import minimize_scalar
 
         best, low = term, self.chi2([*others, term])
         for k, name in enumerate(term.effect.nonlinear()):
             p = term.effect.parameters()[name]
+            if name in kept:
+                continue
             if p.discrete:
                 best, low = self._best_of(best, k, p.grid, others)
                 continue
@@ -186,9 +199,7 @@ class Search:
     def run(self, most: int = MOST) -> None:
         """Adds effects one by one while the best passes the threshold and buys its share; fills ``findings``."""
         while True:
-            gram, ranking = self.scan()
-            self.space.refit_noise([*self.chosen, *self._company(gram, ranking)])
-            _, ranking = self.scan()
+            ranking = self.prepare()
             # Half of the noise's uncertainty is that of every z.
             self.threshold = self.null_tail(self.terms()) * (1.0 + 0.5 * self.space.doubt)
             self.last = ranking
@@ -213,13 +224,19 @@ class Search:
             self.chosen.append(simplest.term)
             self.settle()
 
+    def prepare(self) -> list[Suspicion]:
+        """Estimates the noise beside the chosen and the best classes, and ranks all classes with it."""
+        gram, ranking = self.scan()
+        self.space.refit_noise([*self.chosen, *self._company(gram, ranking)])
+        return self.scan()[1]
+
     def rivals(self) -> list[list[Suspicion]]:
         """For each chosen effect, every effect that would serve in its place, the others kept: itself first or near."""
         answer = []
         for k, term in enumerate(self.chosen):
             others = [*self.chosen[:k], *self.chosen[k + 1 :]]
             now = self.chi2(others)
-            trial = Search(self.space, self.suspects, self.rng, chosen=others, _columns=self._columns)
+            trial = Search(self.space, self.suspects, self.rng, chosen=others, columns=self.columns)
             _, ranking = trial.scan()
             field = [Suspicion(term, now - self.chi2([*others, term]), 0.0)]
             for s in ranking[:8]:
@@ -254,7 +271,7 @@ class Search:
         while len(self.chosen) - self.given >= 2:
             for i, j in combinations(range(self.given, len(self.chosen)), 2):
                 others = [t for k, t in enumerate(self.chosen) if k not in (i, j)]
-                trial = Search(self.space, self.suspects, self.rng, chosen=others, _columns=self._columns)
+                trial = Search(self.space, self.suspects, self.rng, chosen=others, columns=self.columns)
                 _, ranking = trial.scan()
                 both = self.chi2(self.chosen)
                 for s in ranking[:4]:

@@ -1,7 +1,7 @@
 """The whitened space in which models of one record are compared: rows, base, suspects' columns, and their Gram.
 
-One pass whitens the output, the base and every candidate column and forms their Gram matrix; everything after it (gains
-by Schur complement, thresholds, refits) is small. METHOD 3, steps 2 and 3.
+Rows are condensed and columns whitened once for each noise; whatever is asked of models after that (gains by Schur
+complement, thresholds, errors on data left out) is asked of small matrices. METHOD 3, steps 2 and 3.
 """
 
 from __future__ import annotations
@@ -10,23 +10,29 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core.condense import Operator, condense, integrals
 from calib_core.effects.base import Acts, Covariates, Effect
+from calib_core.gap_gram import Bank, Folds, Gram
 from calib_core.integral_fit import Design
 from calib_core.noise_fit import NoiseFit, first_guess, fit_noise
-from calib_core.whitening import RowNoise, Whitener
+from calib_core.whitening import RowNoise, Rows, Whitener
 
 F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 
 OVERSTATED = 2.0
 FEIGNED_STEPS = 0.014
 """A shape of this size, RMS in encoder steps, may come from the codes themselves."""
+REMEMBERED = 24
+"""So many terms beside the listed ones are kept whitened."""
+TOGETHER = 16
+"""So many terms are whitened at a time."""
+LONG = 60_000
+"""Rows from which columns are kept in single precision: they are long, and rounding them is like noise of 10⁻⁷."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +70,14 @@ class Space:
     covariates: Covariates
     values: F64
     """(b,) bias and, where something moved, scale factor."""
+    rows: Rows = field(init=False)
+    """The design's, condensed: (n,) of them."""
     base: F64 = field(init=False)
     """(n, b') their columns, and that of what sampling hides."""
     prior: F64 = field(init=False)
     """(b',) one over the standard deviation that a coefficient is known to have; 0 where nothing is known."""
+    rough_noise: float = field(init=False)
+    """Of one sample, from the scatter of neighbours."""
     noise: NoiseFit = field(init=False)
     whitener: Whitener = field(init=False)
 
@@ -77,9 +87,16 @@ class Space:
             # A motion that repeats the same codes does not average their error: each counts as one.
             variance = design.rows.reading_variance * design.readings.recurrence
             self.design = design = replace(design, rows=replace(design.rows, reading_variance=variance))
-        one = np.ones((len(design.rows), 1))
+        self.rows, self._condensing = condense(design)
+        fine = design.output(0.0)
+        self._output, self._rate = self._condensing @ fine, self._condensing @ design.rate
+        self.rough_noise = first_guess(design.rows, fine)
+        third = np.abs(np.diff(design.averages.samples.output, 3))
+        self._least_noise = 0.9 * max(float(np.median(third)) / (0.6745 * math.sqrt(20.0)), 1e-12)
+        self.folds = Folds.of(self.rows.time_s)
+        one = np.ones((len(self.rows), 1))
         self.values = self.values[: 2 if design.moves else 1]
-        rate = design.rate[:, None]
+        rate = self._rate[:, None]
         if design.readings is not None:
             rate = self.over_rows(Acts.ANGLE, self.covariates.position_deg[:, None]) / -(self.scale_factor or 1.0)
         self.base = np.column_stack([one, rate]) if design.moves else one
@@ -91,13 +108,13 @@ class Space:
             bend = np.gradient(self._felt(), samples.interval_s)[:, None]
             self.base = np.column_stack([self.base, self.over_rows(Acts.ANGLE, bend)])
             self.prior = np.append(self.prior, 8.0 / samples.interval_s**2)
-        self._output = design.output(0.0)
-        third = np.abs(np.diff(design.averages.samples.output, 3))
-        self._rough_noise = max(float(np.median(third)) / (0.6745 * math.sqrt(20.0)), 1e-12)
+        self._listed: tuple[Term, ...] = ()
+        self._places: dict[int, list[int]] = {}
         self.refit_noise([])
         for _ in range(2):
             step, _ = self.gram([]).coefficients([])
             self.values = self.values + step[: len(self.values)]
+            self.use_noise(self.noise)
 
     @property
     def scale_factor(self) -> float:
@@ -107,8 +124,13 @@ class Space:
     @property
     def residual(self) -> F64:
         """(n,) output less the base model's."""
-        residual: F64 = self._output - self.values[0] - self.scale_factor * self.design.rate
+        residual: F64 = self._output - self.values[0] - self.scale_factor * self._rate
         return residual
+
+    @property
+    def precision(self) -> type[np.floating[Any]]:
+        """In which columns are kept."""
+        return np.float32 if len(self.rows) > LONG else np.float64
 
     def refit_noise(self, terms: Iterable[Term]) -> None:
         """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew.
@@ -116,10 +138,9 @@ class Space:
         The codes' error is a sawtooth, not white; overstated, it leaves nothing for AR(1) noise to pose as.
         """
         columns = np.column_stack([self.base, *(t.columns for t in terms)])
-        rows, residual = self.design.rows, self.residual
-        rows = replace(rows, reading_variance=OVERSTATED * rows.reading_variance)
-        noise = fit_noise(rows, residual, columns, self.scale_factor, RowNoise(first_guess(rows, residual)))
-        least = math.log(0.9 * self._rough_noise)
+        rows = replace(self.rows, reading_variance=OVERSTATED * self.rows.reading_variance)
+        noise = fit_noise(rows, self.residual, columns, self.scale_factor, RowNoise(self.rough_noise))
+        least = math.log(self._least_noise)
         if noise.logarithms[0] < least:
             # Without rests the encoder's error hides the gyro's noise, but not from the output's own scatter.
             logarithms, covariance = noise.logarithms.copy(), noise.covariance.copy()
@@ -130,7 +151,13 @@ class Space:
     def use_noise(self, noise: NoiseFit) -> None:
         """Whitens with this noise from now on."""
         self.noise = noise
-        self.whitener = Whitener(self.design.rows, self.scale_factor, noise.noise)
+        self.whitener = Whitener(self.rows, self.scale_factor, noise.noise)
+        self._bank: Bank | None = None
+        self._whitened: dict[int, tuple[Term, F64]] = {}
+
+    def enlist(self, terms: Sequence[Term]) -> None:
+        """These will be asked for together, again and again: their Gram matrix is made once for each noise."""
+        self._listed, self._bank = tuple(terms), None
 
     @property
     def doubt(self) -> float:
@@ -149,7 +176,8 @@ class Space:
             moving = shapes[self.covariates.rate_dps != 0.0]
             size = FEIGNED_STEPS * self.design.readings.step_deg
             slack = size**2 / np.maximum(moving.var(axis=0), 1e-300)
-        return Term(effect, tuple(setting), names, self.over_rows(acts, shapes), slack)
+        columns = self.over_rows(acts, shapes).astype(self.precision, copy=False)
+        return Term(effect, tuple(setting), names, columns, slack)
 
     def shapes(self, term: Term) -> tuple[Acts, F64]:
         """The term's columns (k, p) at the samples, and what they act on."""
@@ -162,42 +190,26 @@ class Space:
         named = effect.columns(self.covariates, **dict(zip(effect.nonlinear(), setting, strict=True)))
         return tuple(named), effect.acts, np.column_stack([*named.values()])
 
-    def over_rows(self, acts: Acts, shapes: F64) -> F64:
+    def over_rows(self, acts: Acts, shapes: F64 | Operator) -> F64:
         """(n, p) in the unit of the output, from shapes (k, p) at the samples in what the effect acts on."""
-        averages = self.design.averages
-        single, between, (begin, at_begin), (end, at_end), dt = self._intervals
-        out = np.zeros((len(averages.at), shapes.shape[1]))
-        if acts is Acts.ANGLE:
-            if self.design.readings is None:
-                # Without an encoder every row is a sample in motion; at its rests an encoder's error does not change.
-                out[single] = np.gradient(shapes, averages.samples.interval_s, axis=0)[averages.at[single]]
-            out[between] = (_inside(shapes, end, at_end) - _inside(shapes, begin, at_begin)) / dt
-            return -self.scale_factor * out
-        out[single] = shapes[averages.at[single]]
-        if len(dt):
-            h = np.diff(averages.samples.time_s)[:, None]
-            h[averages.samples.start[1:]] = 0.0
-            total = np.zeros_like(shapes)
-            np.cumsum(h * (shapes[1:] + shapes[:-1]) / 2.0, axis=0, out=total[1:])
-            out[between] = (
-                total[end] - total[begin] + h[end] * at_end * (shapes[end] + _inside(shapes, end, at_end)) / 2.0
-                - h[begin] * at_begin * (shapes[begin] + _inside(shapes, begin, at_begin)) / 2.0
-            ) / dt  # fmt: skip
-        return (self.scale_factor if acts is Acts.RATE else 1.0) * out
+        mean, change = self._operators
+        if acts is not Acts.ANGLE:
+            columns = mean @ shapes
+            scale = self.scale_factor if acts is Acts.RATE else 1.0
+        elif self.design.readings is None:
+            # Without an encoder every row is samples in motion; at its rests an encoder's error does not change.
+            averages = self.design.averages
+            columns = self._condensing @ np.gradient(shapes, averages.samples.interval_s, axis=0)[averages.at]
+            scale = -self.scale_factor
+        else:
+            columns, scale = change @ shapes, -self.scale_factor
+        return np.asarray(scale * (columns if isinstance(columns, np.ndarray) else columns.toarray()))
 
     @cached_property
-    def _intervals(self) -> tuple[Mask, Mask, tuple[Ints, F64], tuple[Ints, F64], F64]:
-        """Which rows are samples and which are intervals; where intervals begin and end among the samples."""
-        averages = self.design.averages
-        between = averages.at < 0
-        time = averages.samples.time_s
-
-        def place(at_s: F64) -> tuple[Ints, F64]:
-            k = np.clip(np.searchsorted(time, at_s, side="right") - 1, 0, len(time) - 2)
-            return k, ((at_s - time[k]) / (time[k + 1] - time[k]))[:, None]
-
-        begin, end = averages.begin_s[between], averages.end_s[between]
-        return ~between, between, place(begin), place(end), (end - begin)[:, None]
+    def _operators(self) -> tuple[Operator, Operator]:
+        """Sparse (n, k), from samples to means over the rows, and to changes."""
+        mean, change = integrals(self.design.averages)
+        return self._condensing @ mean, self._condensing @ change
 
     def _felt(self) -> F64:
         """(k,) the measured rate, zero at rest; the reference's own where it is a rate."""
@@ -221,65 +233,49 @@ class Space:
         return sign * shape[:, None]
 
     def white(self, columns: F64) -> F64:
-        """(n + b', p) whitened columns, with room below for what is known beforehand."""
-        return np.vstack([self.whitener.whiten(columns), np.zeros((len(self.prior), columns.shape[1]))])
+        """(n, p) whitened columns."""
+        return self.whitener.whiten(columns)
 
-    def gram(self, terms: Sequence[Term]) -> Gram:
-        """Whitens the residual, the base and the terms' columns and forms their Gram matrix."""
-        columns = [self.residual, self.base, *(t.columns for t in terms)]
-        white = self.white(np.column_stack(columns))
-        b = len(self.prior)
-        white[-b:, 1 : 1 + b] = np.diag(self.prior)
-        return Gram(white, b)
+    def whitened(self, term: Term) -> F64:
+        """(n, p) the term's columns, whitened."""
+        if id(term) not in self._whitened:
+            if len(self._whitened) >= REMEMBERED:
+                del self._whitened[next(iter(self._whitened))]
+            self._whitened[id(term)] = (term, self.white(term.columns))
+        return self._whitened[id(term)][1]
 
+    def gram(self, terms: Sequence[Term], *, folds: bool = False) -> Gram:
+        """The Gram matrix of the whitened residual, the base and the terms' columns; with ``folds``, in its parts."""
+        bank, head = self.bank, 1 + len(self.prior)
+        inside, own, order, ahead = list(range(head)), [], list(range(head)), 0
+        for term in terms:
+            count = term.columns.shape[1]
+            if id(term) in self._places:
+                order += range(len(inside), len(inside) + count)
+                inside += self._places[id(term)]
+            else:
+                order += range(-1 - ahead, -1 - ahead - count, -1)
+                own.append(self.whitened(term))
+                ahead += count
+        # Negative places count one's own columns, which stand behind the bank's.
+        order = [k if k >= 0 else len(inside) - 1 - k for k in order]
+        parts = bank.parts_with(inside, own, folds=folds)
+        return Gram(parts[:, order][:, :, order], self.prior)
 
-class Gram:
-    """The scaled Gram matrix of [residual, base, columns], and what follows from it."""
-
-    def __init__(self, white: F64, base: int) -> None:
-        self.white = white
-        self.base = base
-        scale = np.sqrt(np.einsum("ij,ij->j", white, white))
-        self.scale = np.where(scale > 0.0, scale, 1.0)
-        self.matrix = (white / self.scale).T @ (white / self.scale)
-
-    def without(self, kept: Sequence[int]) -> F64:
-        """The matrix with the base and the columns ``kept`` (indices from 1 + base) projected out."""
-        held = [*range(1, 1 + self.base), *kept]
-        block = self.matrix[np.ix_(held, held)]
-        weights = np.linalg.lstsq(block, self.matrix[held], rcond=1e-12)[0]
-        out: F64 = self.matrix - self.matrix[:, held] @ weights
-        return out
-
-    def gain(self, projected: F64, columns: Sequence[int], term: Term) -> tuple[float, float]:
-        """2ΔlnL of adding ``term``, which stands in ``columns``, and what of it its slack could not feign.
-
-        NaN where what is projected out spans the columns. A coefficient that is known (``term.fixed``) is one.
-        """
-        block = projected[np.ix_(columns, columns)]
-        if np.diag(block).min() < 1e-7:
-            return float("nan"), float("nan")
-        size = self.scale[list(columns)]
-        score = projected[list(columns), 0] * self.scale[0]
-        if term.fixed:
-            gain = float(2.0 * score[0] * size[0] - block[0, 0] * size[0] ** 2)
-            return gain, gain
-        inverse = np.linalg.pinv(block, rcond=1e-9, hermitian=True)
-        value = inverse @ score
-        gain = float(score @ value)
-        if not term.slack.any():
-            return gain, gain
-        return gain, float(value @ np.linalg.solve(inverse + np.diag(term.slack * size**2), value))
-
-    def coefficients(self, columns: Sequence[int]) -> tuple[F64, F64]:
-        """Coefficients and covariance of the base's corrections and of ``columns``."""
-        held = [*range(1, 1 + self.base), *columns]
-        block = self.matrix[np.ix_(held, held)]
-        inverse = np.linalg.pinv(block, rcond=1e-12, hermitian=True)
-        size = self.scale[held]
-        return inverse @ self.matrix[held, 0] * self.scale[0] / size, inverse / np.outer(size, size)
-
-
-def _inside(shapes: F64, at: Ints, fraction: F64) -> F64:
-    """(r, p) values between the samples ``at`` (r,) and the next, ``fraction`` (r, 1) of the way."""
-    return np.asarray(shapes[at] + fraction * (shapes[at + 1] - shapes[at]))
+    @property
+    def bank(self) -> Bank:
+        """The residual, the base and the listed terms, whitened with the noise of now."""
+        if self._bank is None:
+            together = [np.column_stack([self.residual, self.base])]
+            self._places, at = {}, together[0].shape[1]
+            white = np.empty((len(self.rows), at + sum(t.columns.shape[1] for t in self._listed)), self.precision)
+            white[:, :at] = self.white(together[0])
+            for begin in range(0, len(self._listed), TOGETHER):
+                few = self._listed[begin : begin + TOGETHER]
+                columns = np.column_stack([t.columns for t in few])
+                white[:, at : at + columns.shape[1]] = self.white(columns)
+                for term in few:
+                    self._places[id(term)] = list(range(at, at + term.columns.shape[1]))
+                    at += term.columns.shape[1]
+            self._bank = Bank(self.folds, white)
+        return self._bank

@@ -44,10 +44,14 @@ class Structure:
 def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
     """Every covariate's shape beside base and ``chosen``, the most certain first."""
     found = []
-    gram = space.gram(chosen)
-    held = gram.white[:, 1 : 1 + gram.base + sum(t.columns.shape[1] for t in chosen)]
+    held = np.column_stack([space.white(space.base), *(space.whitened(t) for t in chosen)])
+    prior = np.zeros((len(space.prior), held.shape[1]))
+    np.fill_diagonal(prior, space.prior)
+    held = np.vstack([held, prior])
     own, _ = np.linalg.qr(held / np.sqrt(np.einsum("ij,ij->j", held, held) + 1e-300))
-    residual = gram.white[:, 0] - own @ (own.T @ gram.white[:, 0])
+    own = own[: len(space.rows)]
+    residual = space.white(space.residual)
+    residual = residual - own @ (own.T @ residual)
     for covariate, shapes in _shapes(space).items():
         columns = _basis(space.over_rows(Acts.OUTPUT, shapes), space.base)
         white = space.white(columns)
@@ -87,10 +91,10 @@ def _slack(space: Space, columns: F64) -> F64:
     design = space.design
     if design.readings is None:
         return np.zeros(columns.shape[1])
-    moving = design.averages.at < 0
-    angle = np.cumsum(columns[moving] * design.rows.dt_s[moving, None], axis=0) / space.scale_factor
+    moving = space.rows.after >= 0
+    angle = np.cumsum(columns[moving] * space.rows.dt_s[moving, None], axis=0) / space.scale_factor
     # Within a second or so: slower than that the encoder's codes average out.
-    span = max(2, round(1.0 / design.averages.samples.interval_s))
+    span = max(2, round(1.0 / float(np.median(space.rows.dt_s[moving]))))
     swing = angle[span:] - angle[:-span] if len(angle) > 2 * span else angle
     return np.asarray((FEIGNED_STEPS * design.readings.step_deg) ** 2 / np.maximum(swing.var(axis=0) / 2.0, 1e-300))
 
