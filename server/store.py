@@ -13,6 +13,7 @@ from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
 from server.store_experiments import Experiments
+from server.store_lab import Lab
 from server.store_notebooks import Notebooks
 from server.store_recordings import Recordings
 from server.store_rig import RigRecords
@@ -32,6 +33,7 @@ class Store:
         self.experiments = Experiments(self.connection)
         self.rig_records = RigRecords(self.connection)
         self.notebooks = Notebooks(self.connection)
+        self.lab = Lab(self.connection)
 
     def recording(self, recording: str) -> Recording:
         return self.recordings.load(recording)

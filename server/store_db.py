@@ -92,6 +92,29 @@ def _notebooks(db: Database) -> None:
         )
 
 
+@migrations(name="0005_lab")
+def _lab(db: Database) -> None:
+    db.table("lab_exercises").create(
+        {"code": str, "key": str, "title": str, "axis": str, "truth": str, "starter": str, "created_at": str,
+         "revealed_at": str},
+        pk="code",
+    )  # fmt: skip
+    db.table("lab_students").create(
+        {"id": str, "code": str, "name": str, "notebook": str, "bench_s": float, "session": int, "answer": str,
+         "diagnosis": str, "submitted_at": str, "created_at": str},
+        pk="id",
+        foreign_keys=[("code", "lab_exercises", "code")],
+    )  # fmt: skip
+    db.table("lab_students").create_index(["code"])
+    db.table("lab_runs").create(
+        {"recording": str, "student": str, "session": int, "numbers": str, "motion": str, "begin_s": float,
+         "end_s": float, "run_s": float, "created_at": str},
+        pk="recording",
+        foreign_keys=[("student", "lab_students", "id")],
+    )  # fmt: skip
+    db.table("lab_runs").create_index(["student"])
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

@@ -7,6 +7,7 @@ from server.api import (
     experiments,
     gyro_models,
     health,
+    lab,
     live,
     notebooks,
     recordings,
@@ -26,6 +27,7 @@ ROUTERS = (
     diagnoses.router,
     experiments.router,
     notebooks.router,
+    lab.router,
     certificates.router,
     thesis.router,
 )

@@ -63,12 +63,14 @@ class Changed(models.Body):
 
 
 class Numbers(models.Body):
+    """One motion, as CONTRACT 3 writes it."""
+
     axis: models.Axis
     kind: Literal["sine", "multisine", "staircase", "hold", "poses", "heat"]
-    amplitude_deg: list[float] = Field([], max_length=50)
-    frequency_hz: list[float] = Field([], max_length=50)
-    rates_dps: list[float] = Field([], max_length=50)
-    angles_deg: list[float] = Field([], max_length=50)
+    amplitude_deg: list[Annotated[float, Field(ge=0, le=360)]] = Field([], max_length=50)
+    frequency_hz: list[Annotated[float, Field(gt=0, le=1000)]] = Field([], max_length=50)
+    rates_dps: list[Annotated[float, Field(ge=0.1, le=5000)]] = Field([], max_length=50)
+    angles_deg: list[Annotated[float, Field(ge=-3600, le=3600)]] = Field([], max_length=50)
     duration_s: Annotated[float, Field(gt=0, le=3600)]
 
 
