@@ -16,7 +16,7 @@ from servos import Servos, start
 
 from calib_core.problem import Problem
 from calib_core.sequence import Move, Wave
-from server.devices import DeviceError, dynamixel_table
+from server.devices import DeviceError, dynamixel_bus, dynamixel_table
 from server.devices.dynamixel_registers import Register, to_deg, word
 from server.devices.dynamixel_table import DynamixelTable
 
@@ -342,6 +342,19 @@ def test_a_servo_that_falls_silent_ends_it_and_the_other_lets_go(table: Dynamixe
     servos.bus.rejoin(1)
     table.open()
     assert torque(servos) == [0, 0]
+
+
+def test_a_busy_host_is_no_silent_servo_and_ends_it_only_after_a_while(
+    table: DynamixelTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(dynamixel_bus, "STAMP_S", -1.0)  # every reply comes too late to know when it was made
+        began = time.perf_counter()
+        wait(lambda: time.perf_counter() - began > 1.5 * dynamixel_table.SILENT_S and not len(table.read()["x"].time_s))
+    wait(lambda: len(table.read()["x"].time_s))
+    monkeypatch.setattr(dynamixel_table, "BUSY_S", 2.0 * dynamixel_table.SILENT_S)
+    monkeypatch.setattr(dynamixel_bus, "STAMP_S", -1.0)
+    assert fault(table).code == "rig.host_busy"
 
 
 def test_a_port_that_goes_away_ends_it_and_lets_go_as_soon_as_it_is_back(table: DynamixelTable, servos: Servos) -> None:

@@ -46,7 +46,8 @@ IDLE_S = 0.2  # between polls while nobody reads
 WANTED_S = 2.0  # after the last read
 HEARTBEAT_S = 10.0  # nobody has read for this long, and the torque is on: whoever moved the table is gone
 NAP_S = 0.002  # a stop waits at most this long for the thread to look up, plus one transaction
-SILENT_S, MISSES = 0.4, 5  # a servo without a usable reply for this long, and so many times, is gone
+SILENT_S, MISSES = 0.4, 5  # a servo without a good reply for this long, and so many times, is gone
+BUSY_S = 2.0  # it answers, but for this long the host never read it in time to know when
 RETRY_S = 0.2  # a port that went away is looked for this often
 OPEN_S, SAFE_S = 8.0, 1.0
 LET_GO_S = 0.5  # torque off is said again until it is seen, this long
@@ -97,6 +98,7 @@ class _Servo:
     powered: bool = False
     last: State | None = None
     seen_s: float = -math.inf
+    heard_s: float = -math.inf  # also by replies whose time is not known
     missed: int = 0
     wild: int = 0
     course: _Course | None = None
@@ -184,7 +186,7 @@ class DynamixelTable:
             for axis, servo in self._servos.items():
                 pairs = np.array(servo.readings).reshape(-1, 2)
                 servo.readings.clear()
-                taken[axis] = Readings(pairs[:, 0], pairs[:, 1])
+                taken[axis] = Readings(pairs[:, 0], pairs[:, 1], servo.heard_s)
             return taken
 
     def telemetry(self) -> dict[str, Telemetry]:
@@ -298,7 +300,8 @@ class DynamixelTable:
         now = clock()
         for axis, servo in self._servos.items():
             servo.highest_degC = setups[axis].highest_degC
-            servo.seen_s, servo.last, servo.missed, servo.course = now, None, 0, None
+            servo.seen_s = servo.heard_s = now
+            servo.last, servo.missed, servo.course = None, 0, None
             servo.readings.clear()
             self.bus.alarms(servo.number)  # of what was before
             self._axes[axis] = setups[axis].axis(axis)
@@ -376,7 +379,8 @@ class DynamixelTable:
             self.bus.lost["garbled"] += 1
             self._missed(axis, NoReply("garbled"))
             return
-        servo.last, servo.seen_s, servo.missed, servo.wild = said, reply.time_s, 0, 0
+        servo.seen_s = servo.heard_s = reply.time_s
+        servo.last, servo.missed, servo.wild = said, 0, 0
         with self._changed:
             servo.readings.append((reply.time_s, said.angle_deg))
         self._watch(axis, said)
@@ -398,7 +402,10 @@ class DynamixelTable:
     def _missed(self, axis: str, no: NoReply) -> None:
         servo = self._servos[axis]
         servo.missed += 1
-        if servo.missed > MISSES and clock() - servo.seen_s > SILENT_S:
+        now = clock()
+        if no.why == "unstamped":
+            servo.heard_s = now
+        if servo.missed > MISSES and (now - servo.heard_s > SILENT_S or now - servo.seen_s > BUSY_S):
             raise self._silent(axis, no)
 
     def _silent(self, axis: str, no: NoReply) -> DeviceError:

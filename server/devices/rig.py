@@ -28,7 +28,7 @@ SCALES = {"temperature_c": 100.0, "supply_v": 2.0}  # an LM35, 10 mV/°C, and a 
 STALL_DEG = 3.0
 STALL_LAG_S = 0.3  # a shaft may be this far behind its command
 LATE_S = 0.05  # rows that waited this long are read before a motion starts
-SILENT_S = 0.5  # no reading of a servo for this long is a fault
+SILENT_S = 0.5  # no answer of a servo for this long is a fault
 FELT_DPS, FELT_DEG, FELT_V = 20.0, 20.0, 0.015  # turned this fast and this far, the output must have moved this much
 
 
@@ -51,6 +51,7 @@ class _Shaft:
     angle_deg: F64 = field(default_factory=lambda: np.empty(0))
     seen_s: float = -np.inf
     seen_deg: float = np.nan
+    heard_s: float = -np.inf
     low_V: float = np.inf
     high_V: float = -np.inf
     felt: bool = False
@@ -260,6 +261,7 @@ class Rig:
         for axis, shaft in self._shafts.items():
             read = readings[axis]
             shaft.take(self.clock.to_daq(read.time_s) + self._one_way_s, read.angle_deg)
+            shaft.heard_s = max(shaft.seen_s, float(self.clock.to_daq(np.array([read.heard_s]))[0]))
             angle, at = shaft.rows(float(time_s[0]) - ROW_S / 2, n)
             columns[f"{axis}_position_deg"], columns[f"{axis}_position_time_s"] = angle, at
             self._watch(axis, shaft, columns.get(f"{axis}_gyro_v"))
@@ -268,10 +270,11 @@ class Rig:
     def _watch(self, axis: str, shaft: _Shaft, volts: F64 | None) -> None:
         """Raise the fault of this axis, if there is one."""
         who = {"axis": axis, "part": self.axes[axis].part}
-        if self._now_s - max(shaft.seen_s, 0.0) > SILENT_S:
+        if self._now_s - max(shaft.heard_s, 0.0) > SILENT_S:
             raise self._fault(f"servo {axis}", "rig.servo_silent", **who)
         allowed = [shaft.commanded_deg(shaft.seen_s - lag) for lag in (0.0, STALL_LAG_S / 2, STALL_LAG_S)]
-        if not min(allowed) - STALL_DEG <= shaft.seen_deg <= max(allowed) + STALL_DEG and shaft.motion is not None:
+        seen = shaft.motion is not None and shaft.seen_s > shaft.started_s
+        if seen and not min(allowed) - STALL_DEG <= shaft.seen_deg <= max(allowed) + STALL_DEG:
             raise self._fault(f"servo {axis}", "rig.stalled", **who, at_deg=shaft.seen_deg, sent_deg=allowed[0])
         if volts is None:
             return
