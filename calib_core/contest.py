@@ -24,6 +24,8 @@ from calib_core.prospect import Hand, clipping, imagine
 F64 = NDArray[np.float64]
 Setting = tuple[float, ...]
 
+BASE = 3
+"""Bias, scale factor, and what sampling hides."""
 CLIPS = 16
 """Clip levels tried, from half of the fastest rate on."""
 
@@ -64,7 +66,7 @@ class Contest:
         self.fits = [[(e, s) for s in _tries(hand, e, [t[1] for t in truths if t[0] is e])] for e in fits]
         self._places: list[list[list[int]]] = []
         self._held: list[int] = []
-        self.in_hand = self._columns(hand.space)
+        self.in_hand = Columns.of(np.vstack([self._columns(hand.space).r, self._prior(hand.space)]))
 
     def after(self, motion: Sequence[Excitation]) -> Columns:
         """The columns of both records, once ``motion`` has been done."""
@@ -81,7 +83,7 @@ class Contest:
     def _columns(self, space: Space) -> Columns:
         """[signals, base, kept, fits at every setting], whitened."""
         found = [_term(space, effect, setting).columns @ sizes for effect, setting, sizes in self.truths]
-        base = np.zeros((len(space.base), len(self.values)))
+        base = np.zeros((len(space.base), BASE))
         base[:, : space.base.shape[1]] = space.base
         parts = [np.column_stack(found), base, *(_term(space, t.effect, t.setting).columns for t in self.hand.kept)]
         width = sum(p.shape[1] for p in parts)
@@ -96,6 +98,13 @@ class Contest:
                 parts.append(columns)
             self._places.append(places)
         return Columns.of(space.whitener.whiten(np.column_stack(parts)))
+
+    def _prior(self, space: Space) -> F64:
+        """(1, p) what is known beforehand: how much point samples may hide. Both records share that coefficient."""
+        row = np.zeros((1, self._held[-1] + 1 + sum(len(p) for places in self._places for p in places)))
+        if len(space.prior) == BASE:
+            row[0, self._held[0] + BASE - 1] = space.prior[-1]
+        return row
 
 
 def sizes_in(hand: Hand, term: Term) -> F64:

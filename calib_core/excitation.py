@@ -160,21 +160,23 @@ def menu(axis: str, rig: Mapping[str, Axis], sensor_dps: Mapping[str, float], *,
         fastest = top if on == axis else NEAR_TOP * min(rig[on].max_rate_dps, sensor_dps.get(on, math.inf))
         far = _reach(rig[on])
         sizes = [
-            round(min(s * fastest / (2.0 * math.pi * f), s * min(far, 30.0)), 3)
+            math.floor(1e3 * min(s * fastest / (2.0 * math.pi * f), s * min(far, 30.0))) / 1e3
             for f, s in zip(hz, shares, strict=True)
         ]
         return Excitation(on, kind, seconds, amplitude_deg=tuple(sizes), frequency_hz=hz)
 
     fast = (1.0137, 2.0171, 4.0313)
-    rates = tuple(round(top * part, 1) for part in (0.1, 0.25, 0.45, 0.65, 0.85, 1.0))
-    poses = tuple(round(reach * part) for part in (-1.0, -0.5, 0.25, 0.75, 1.0, 0.5, -0.25, -0.75, 0.0))
-    slow = tuple(min(rate, top) for rate in (4.0, 9.0, 19.0))
+    # A stroke at full speed needs its way: where the axis cannot go far it is slower.
+    quick = top if reach == FAR_DEG else min(top, 2.0 * reach / STROKE_S)
+    rates = tuple(math.floor(10.0 * quick * part) / 10.0 for part in (0.1, 0.25, 0.45, 0.65, 0.85, 1.0))
+    poses = tuple(math.trunc(reach * part) for part in (-1.0, -0.5, 0.25, 0.75, 1.0, 0.5, -0.25, -0.75, 0.0))
+    slow = tuple(min(rate, quick) for rate in (4.0, 9.0, 19.0))
     offered += [
         [waves("multisine", fast, (0.34, 0.33, 0.33), 100.0, axis)],
         [waves("multisine", fast, (0.05, 0.1, 0.85), 100.0, axis)],
         [waves("sine", (0.2513,), (1.0,), 99.5, axis)],
         [waves("multisine", (0.1037, 0.7193), (0.3, 0.1), 100.0, axis)],
-        [Excitation(axis, "sine", 98.5, amplitude_deg=(reach,), frequency_hz=(0.0203,))],
+        [Excitation(axis, "sine", 98.5, amplitude_deg=(math.floor(1e3 * reach) / 1e3,), frequency_hz=(0.0203,))],
         [Excitation(axis, "staircase", 100.0, rates_dps=rates)],
         [Excitation(axis, "staircase", 100.0, rates_dps=rates[2:])],
         [Excitation(axis, "staircase", 100.0, rates_dps=slow)],
@@ -183,7 +185,7 @@ def menu(axis: str, rig: Mapping[str, Axis], sensor_dps: Mapping[str, float], *,
     ]
     if axis != "x" and "x" in rig:
         offered.append(
-            [Excitation("x", "poses", 100.0, angles_deg=tuple(round(_reach(rig["x"]) * p / reach) for p in poses))]
+            [Excitation("x", "poses", 100.0, angles_deg=tuple(math.trunc(_reach(rig["x"]) * p / reach) for p in poses))]
         )
     if other is not None:
         offered.append([waves("sine", (0.4019,), (1.0,), 100.0, other)])

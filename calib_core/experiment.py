@@ -132,7 +132,9 @@ def propose(
     if diagnosis.unknown is not None:
         return explore(hand, diagnosis.unknown, rig, sensor)
     dormant = {row["effect"] for row in diagnosis.candidates if row["status"] == "not_excited"}
-    return excite(hand, [e for name, e in search.suspects.items() if name in dormant], rig, sensor)
+    late = any(t.effect.curvature is not None for t in named)
+    suspects = [e for n, e in search.suspects.items() if n in dormant and not (late and e.curvature is not None)]
+    return excite(hand, suspects, rig, sensor)
 
 
 def separate(
@@ -169,9 +171,9 @@ def excite(
     rig: Mapping[str, Axis] = RIG,
     sensor: Mapping[str, float] | None = None,
 ) -> Proposal | None:
-    """The motion that would show most of ``suspects``, were they there at their typical size; None without any.
+    """The motion that would show most of ``suspects``, were they there at their typical size; None where none would.
 
-    ``separates`` names those that it would show; where there are none, the one that comes nearest.
+    ``separates`` names those that it would show.
     """
     truths = []
     for effect in suspects:
@@ -189,9 +191,10 @@ def excite(
 
     offered = [Offer(motion, evidence(columns)) for motion, columns in _played(contest, rig, sensor)]
     best, before = _cheapest(offered), evidence(contest.in_hand)
-    shown = best.settled or (int(np.argmax(best.evidence)),)
-    names = tuple(truths[k][0].name for k in shown)
-    return Proposal("not_excited", names, best, min(before[k] for k in shown), offered=tuple(offered))
+    if not best.settled:
+        return None
+    names = tuple(truths[k][0].name for k in best.settled)
+    return Proposal("not_excited", names, best, min(before[k] for k in best.settled), offered=tuple(offered))
 
 
 def explore(
@@ -258,9 +261,14 @@ def _played(
 
 
 def _cheapest(offered: Sequence[Offer]) -> Offer:
-    """Of the motions that decide most and bring nearly the most, or plenty, the one that takes least."""
+    """Of the motions that decide most and bring nearly the most, or plenty, the one that takes least.
+
+    The board is warmed, which takes a hand, only where nothing else decides as much.
+    """
     most = max(len(offer.settled) for offer in offered)
     good = [offer for offer in offered if len(offer.settled) == most]
+    if most:
+        good = [offer for offer in good if all(e.kind != "heat" for e in offer.motion)] or good
     enough = min(NEARLY * max(offer.expected for offer in good), PLENTY * DECIDES)
     good = [offer for offer in good if offer.expected >= enough]
     return min(good, key=lambda offer: (len(offer.motion), round(offer.duration_s, -1), -offer.expected))

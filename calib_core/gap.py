@@ -200,6 +200,8 @@ def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis
     """Every effect of the library: tested, not excited by this motion, or without data."""
     c, chosen = search.space.covariates, {t.name for t in search.chosen}
     tested = {s.term.name: s for s in search.last}
+    # Beside what was chosen its rivals have nothing left of their own: they were tested when it was.
+    tested = {s.term.name: s for f in search.findings for s in f.field} | tested
     tested |= {f.chosen.term.name: f.chosen for f in search.findings}
     rows = []
     for name, effect in pool.items():

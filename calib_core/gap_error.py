@@ -31,6 +31,10 @@ class Error:
     blocks: int
 
 
+HARDLY = {"temperature_c": 0.2, "supply_v": 0.005, "other_rate_dps": 1.0}
+"""A covariate that varies less is constant but for its own noise: nothing fails along it."""
+
+
 @dataclass(frozen=True)
 class Failure:
     """A stretch of a covariate where the residual is not noise."""
@@ -175,7 +179,7 @@ class Explanation:
         found = []
         for name, at in self.along().items():
             order = np.argsort(at, kind="stable")
-            if np.ptp(at) <= 0.0 or len(order) < 2 * BINS:
+            if np.ptp(at) <= HARDLY.get(name, 0.0) or len(order) < 2 * BINS:
                 continue
             parts = _stretches(at[order], order)
             # Windows overlap by half: two neighbours count as one and a half.

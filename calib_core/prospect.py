@@ -60,8 +60,9 @@ class Prospect(Space):
         values = self.values
         super().__post_init__()
         self.values = values
-        missing = len(values) - self.base.shape[1]  # a motion that never turns still knows the scale factor
-        self.base = np.column_stack([self.base, np.zeros((len(self.base), missing))])
+        if not self.design.moves:  # a motion that never turns still knows the scale factor
+            self.base = np.column_stack([self.base, np.zeros((len(self.base), len(values) - 1))])
+            self.prior = np.zeros(len(values))
         self.use_noise(self.known)
 
     def refit_noise(self, terms: object) -> None:  # noqa: ARG002
@@ -121,7 +122,7 @@ def _record(hand: Hand, motion: Sequence[Excitation], values: F64) -> Recording:
     readings = hand.space.design.readings
     step = readings.step_deg if readings is not None else ENCODER_DEG
     for name, angle in true.items():
-        if f"{name}_position_deg" in hand.recording.columns:
+        if f"{name}_position_deg" in hand.recording.columns or hand.recording.stationary:
             columns[f"{name}_position_deg"] = np.round(angle[rows] / step) * step if step else angle[rows]
     if readings is None and not hand.recording.stationary:
         columns[f"{axis}_rate_dps"] = rate[rows]

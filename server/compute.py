@@ -141,18 +141,29 @@ def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, An
 
 
 def diagnose(
-    data: Path, recording: str, axis: str | None, effects: Sequence[str], board: str | None = None
+    data: Path,
+    recording: str,
+    axis: str | None,
+    effects: Sequence[str],
+    board: str | None = None,
+    axes: Mapping[str, Mapping[str, Any]] = {},
 ) -> dict[str, Any]:
-    """CONTRACT 3 of a stored recording; of points, of the first board and axis that are meant."""
+    """CONTRACT 3 of a stored recording; of points, of the first board and axis that are meant.
+
+    ``axes``: the rig's, as the worker told them, for what to do next there.
+    """
+    from calib_core.sequence import Axis
     from server import diagnosis
     from server.store import Store
 
     with Store(data) as store:
         row = store.recordings.row(recording)
+        asked = {"axis": axis, "effects": effects, "file": row["name"], "suspects": store.effects.suspects()}
         readings = store.recordings.points(recording)
         if readings is not None:
-            return diagnosis.of_points(readings, axis=axis, effects=effects, file=row["name"], board=board)[0]
-        return diagnosis.of_recording(store.recording(recording), axis=axis, effects=effects, file=row["name"])
+            return diagnosis.of_points(readings, **asked, board=board)[0]
+        rig = {name: Axis(**facts) for name, facts in axes.items()}
+        return diagnosis.of_recording(store.recording(recording), **asked, axes=rig or None)
 
 
 def verify(data: Path, number: str) -> dict[str, Any]:

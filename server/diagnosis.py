@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calib_core.effects import Effect
     from calib_core.points import Points
     from calib_core.recording import Recording
+    from calib_core.sequence import Axis
 
 Words = dict[str, Any]
 
@@ -35,7 +36,13 @@ KINDS = {
 """How names of covariates end, and the texts that tell of them."""
 
 
-def of_file(file: Path, *, axis: str | None = None, effects: Sequence[str] = ()) -> list[Words]:
+def of_file(
+    file: Path,
+    *,
+    axis: str | None = None,
+    effects: Sequence[str] = (),
+    suspects: "Mapping[str, type[Effect]] | None" = None,
+) -> list[Words]:
     """The diagnosis of a recording, or of every board and axis of a file of points. Raises Problem and OSError."""
     from calib_core import points, recording
 
@@ -46,8 +53,8 @@ def of_file(file: Path, *, axis: str | None = None, effects: Sequence[str] = ())
             if problem.code != "recording.is_points":
                 raise
             opened.seek(0)
-            return of_points(points.read(opened), axis=axis, effects=effects, file=file.name)
-    return [of_recording(found, axis=axis, effects=effects, file=file.name)]
+            return of_points(points.read(opened), axis=axis, effects=effects, file=file.name, suspects=suspects)
+    return [of_recording(found, axis=axis, effects=effects, file=file.name, suspects=suspects)]
 
 
 def of_points(
@@ -57,12 +64,14 @@ def of_points(
     effects: Sequence[str] = (),
     file: str | None = None,
     board: str | None = None,
+    suspects: "Mapping[str, type[Effect]] | None" = None,
 ) -> list[Words]:
     """CONTRACT 3 for each board and axis, in the order of the file; only ``board`` and ``axis`` where given."""
     from calib_core.effects import library
     from calib_core.gap_points import diagnose
 
-    _known(effects, library())
+    pool = dict(library() if suspects is None else suspects)
+    _known(effects, pool)
     groups = dict.fromkeys(zip(points.board.tolist(), points.axis.tolist(), strict=True))
     if board is not None and board not in {b for b, _ in groups}:
         raise Problem("diagnosis.no_board", board=board, boards=", ".join(dict.fromkeys(b for b, _ in groups)))
@@ -83,21 +92,32 @@ def of_recording(
     effects: Sequence[str] = (),
     file: str | None = None,
     suspects: "Mapping[str, type[Effect]] | None" = None,
+    axes: "Mapping[str, Axis] | None" = None,
 ) -> Words:
-    """CONTRACT 3 for one axis: the one asked for, else the one that the header names, else the first."""
+    """CONTRACT 3 for one axis: the one asked for, else the one that the header names, else the first.
+
+    ``next_experiment`` is what a rig with ``axes`` could do (None: the usual bench).
+    """
     from calib_core.effects import library
     from calib_core.gap import diagnose
     from calib_core.gap_report import to_json
+    from server.experiments import following
 
     pool = dict(library() if suspects is None else suspects)
     _known(effects, pool)
+    axis = axis_of(recording, axis)
+    found = diagnose(recording, axis, effects=effects, suspects=pool)
+    answer = to_json(found)
+    answer["recording"]["file"] = file
+    return explained(answer) | {"next_experiment": plain(following(found, axes))}
+
+
+def axis_of(recording: "Recording", axis: str | None) -> str:
+    """The axis that is meant; raises Problem where the recording has no such axis."""
     if axis is not None and axis not in recording.axes:
         raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(recording.axes))
     named = recording.header.get("axis", "")
-    axis = axis or (named if named in recording.axes else recording.axes[0])
-    answer = to_json(diagnose(recording, axis, effects=effects, suspects=pool))
-    answer["recording"]["file"] = file
-    return explained(answer)
+    return axis or (named if named in recording.axes else recording.axes[0])
 
 
 def _known(effects: Sequence[str], pool: Iterable[str]) -> None:
@@ -136,9 +156,14 @@ def told(answer: Words, lang: str) -> Words:
     said = answer | {"sentence": render(answer["code"], answer["values"], lang)}
     for part in ("checks", "where_it_fails", "missing", "limits"):
         said[part] = [row | {"sentence": render(row["code"], row["values"], lang)} for row in answer[part]]
-    following = answer["next_experiment"]
-    if following and "code" in following:
-        said["next_experiment"] = following | {"sentence": render(following["code"], following["values"], lang)}
+
+    def sentenced(following: Words) -> Words:
+        return following | {"sentence": render(following["code"], following["values"], lang)}
+
+    if answer["next_experiment"]:
+        said["next_experiment"] = sentenced(answer["next_experiment"])
+    if "experiments" in answer:
+        said["experiments"] = [sentenced(done) for done in answer["experiments"]]
     return said
 
 

@@ -21,27 +21,6 @@ if TYPE_CHECKING:
 Words = dict[str, Any]
 
 
-def propose(
-    recording: "Recording",
-    axis: str,
-    axes: "Mapping[str, Axis] | None" = None,
-    gyro_model: "GyroModel | None" = None,
-    *,
-    effects: Sequence[str] = (),
-    suspects: "Mapping[str, type[Effect]] | None" = None,
-) -> Words:
-    """The diagnosis (CONTRACT 3) with ``next_experiment`` for a rig with ``axes`` (None: the usual bench).
-
-    Without anything to settle ``next_experiment`` is None. Sentences are added by ``diagnosis.told``.
-    """
-    from calib_core.gap import diagnose
-    from calib_core.gap_report import to_json
-
-    found = diagnose(recording, axis, effects=effects, suspects=dict(suspects) if suspects is not None else None)
-    answer = diagnosis.explained(to_json(found))
-    return answer | {"next_experiment": following(found, axes, gyro_model)}
-
-
 def following(
     found: "Diagnosis", axes: "Mapping[str, Axis] | None" = None, gyro_model: "GyroModel | None" = None
 ) -> Words | None:
@@ -105,7 +84,13 @@ def perform(
 
 
 def run(
-    recording: "Recording", axis: str, rig: "Rig", *, effects: Sequence[str] = (), most: int = 1
+    recording: "Recording",
+    axis: str,
+    rig: "Rig",
+    *,
+    effects: Sequence[str] = (),
+    suspects: "Mapping[str, type[Effect]] | None" = None,
+    most: int = 1,
 ) -> tuple[Words, "Recording"]:
     """Diagnoses, and does what would settle it up to ``most`` times: the last diagnosis and all data together.
 
@@ -114,12 +99,16 @@ def run(
     """
     experiments: list[Words] = []
     rig.after(recording.time_s[-1])
-    answer = propose(recording, axis, rig.axes, effects=effects)
+
+    def judge() -> Words:
+        return diagnosis.of_recording(recording, axis=axis, effects=effects, suspects=suspects, axes=rig.axes)
+
+    answer = judge()
     while answer["next_experiment"] and len(experiments) < most:
         following = answer["next_experiment"]
         recording = perform(recording, axis, following["motion"], rig, name=str(len(experiments) + 1))
         experiments.append({**following, "before": answer["verdict"]})
-        answer = propose(recording, axis, rig.axes, effects=effects)
+        answer = judge()
     return answer | {"experiments": experiments}, recording
 
 
@@ -139,7 +128,7 @@ def proposed(
         if axis not in hand.axes:
             raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(hand.axes))
         known = {name: Axis(**facts) for name, facts in axes.items()}
-        answer = propose(hand, axis, known, effects=effects)
+        answer = diagnosis.of_recording(hand, axis=axis, effects=effects, suspects=store.effects.suspects(), axes=known)
         following = answer["next_experiment"]
         if following is None:
             raise Problem("experiment.nothing_open", axis=axis)
@@ -194,7 +183,8 @@ def judged(data: Path, experiment: str) -> None:
         done = store.recording(store.runs.get(row["run"])["recording"])
         try:
             both = join(hand, done, row["axis"], _between(hand.header, done.header))
-            answer = propose(both, row["axis"], effects=row["effects"])
+            suspects = store.effects.suspects()
+            answer = diagnosis.of_recording(both, axis=row["axis"], effects=row["effects"], suspects=suspects)
             board = done.header.get("board", "")
             kept = store.recordings.add(both, board=board, name=f"{board}+{experiment}", source="experiment")
             result: Words = {"recording": kept, "diagnosis": answer}

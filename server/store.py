@@ -12,6 +12,7 @@ from server.settings import data_dir
 from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
+from server.store_effects import Effects
 from server.store_experiments import Experiments
 from server.store_lab import Lab
 from server.store_notebooks import Notebooks
@@ -30,6 +31,7 @@ class Store:
         self.runs = Runs(self.connection)
         self.recordings = Recordings(self.connection)
         self.certificates = Certificates(self.connection)
+        self.effects = Effects(self.connection)
         self.experiments = Experiments(self.connection)
         self.rig_records = RigRecords(self.connection)
         self.notebooks = Notebooks(self.connection)

@@ -96,9 +96,8 @@ class Effects(BaseModel):
     responses=declared(404),
 )
 async def diagnose(recording: str, body: DiagnosisBody, here: Here, lang: Language) -> Diagnosis:
-    answer = await here.compute.run(
-        compute.diagnose, here.store.data, recording, body.axis, tuple(dict.fromkeys(body.effects)), body.board
-    )
+    effects, axes = tuple(dict.fromkeys(body.effects)), (here.supervisor.rig or {}).get("axes", {})
+    answer = await here.compute.run(compute.diagnose, here.store.data, recording, body.axis, effects, body.board, axes)
     return Diagnosis.model_validate(diagnosis.told(answer, lang))
 
 

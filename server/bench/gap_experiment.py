@@ -83,7 +83,7 @@ class Outcome:
 
 def play(case: tuple[int, int]) -> Outcome:
     """Pair number and seed."""
-    from server import experiments
+    from server import diagnosis, experiments
     from server.devices import open_rig
     from server.engine import record
 
@@ -94,7 +94,7 @@ def play(case: tuple[int, int]) -> Outcome:
     rig = open_rig(f"twin:?seed={seed + 1}&covariates=1&warming={pair.warming}&effects={path}:{size:.6g}")
     rig.open()
     hand = record(plan_of(pair.motion, experiment="hand", axis="x"), rig, board=BOARD)
-    first = experiments.propose(hand, "x", rig.axes)
+    first = diagnosis.of_recording(hand, axis="x", axes=rig.axes)
     truth = path.partition(".")[0]
     following: dict[str, Any] = first["next_experiment"] or {}
     tied = tuple(following.get("separates", ())) if first["verdict"] == "ambiguous" else ()
@@ -102,7 +102,7 @@ def play(case: tuple[int, int]) -> Outcome:
     last = first
     if decides:
         both = experiments.perform(hand, "x", following["motion"], rig)
-        last = experiments.propose(both, "x", rig.axes)
+        last = diagnosis.of_recording(both, axis="x", axes=rig.axes)
     return Outcome(
         pair.name,
         truth,

@@ -5,12 +5,18 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from calib_core.problem import Problem
+from server.cli import data_option
+from server.recording_files import form_of, save
 from server.texts import render
 
-EXAMPLE = "gyrobench diagnose LPY-1.csv.gz --axis x"
+EXAMPLE = """gyrobench diagnose LPY-1.csv.gz --axis x
+  gyrobench diagnose calib_core/thesis/data/rate.csv --json
+  gyrobench diagnose LPY-1.csv.gz --rig 'twin:?seed=1' --out both.csv.gz"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -19,12 +25,26 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--axis", choices=("x", "y", "z"), help="the gyro axis (default: the recording's own, or first)"
     )
     parser.add_argument("--effects", type=_names, default=(), metavar="A,B", help="effects that the model already has")
+    parser.add_argument(
+        "--rig", metavar="URL", help="does there what would settle the diagnosis (the same board has to be on it)"
+    )
+    parser.add_argument(
+        "--experiments", type=int, default=1, metavar="N", help="with --rig: at most so many motions (default 1)"
+    )
+    parser.add_argument("--out", metavar="FILE", help="with --rig: all data together, as .csv, .csv.gz or .parquet")
     parser.add_argument("--json", action="store_true", help="one JSON object an input on stdout")
+    data_option(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     from server import diagnosis
 
+    if args.rig is None and args.out:
+        raise Problem("diagnosis.out_without_rig")
+    if args.rig is not None and len(args.files) > 1:
+        raise Problem("diagnosis.one_file", files=len(args.files))
+    if args.out:
+        form_of(Path(args.out))
     for file in args.files:
         if sys.stderr.isatty():
             print(f"\r\033[K{file} …", end="", file=sys.stderr, flush=True)
@@ -38,8 +58,25 @@ def main(args: argparse.Namespace) -> int:
 
 def _of(file: Path, args: argparse.Namespace) -> list[dict[str, Any]]:
     from server import diagnosis
+    from server.store_effects import suspects_of
 
-    return diagnosis.of_file(file, axis=args.axis, effects=args.effects)
+    suspects = suspects_of(args.data)
+    if args.rig is None:
+        return diagnosis.of_file(file, axis=args.axis, effects=args.effects, suspects=suspects)
+    from calib_core.recording import read
+    from server import experiments
+    from server.devices import open_rig
+
+    with file.open("rb") as opened:
+        hand = read(opened, name=file.name)
+    axis = diagnosis.axis_of(hand, args.axis)
+    with closing(open_rig(args.rig)) as rig:
+        rig.open()
+        answer, both = experiments.run(hand, axis, rig, effects=args.effects, suspects=suspects, most=args.experiments)
+    if args.out:
+        save(both, Path(args.out))
+    answer["recording"]["file"] = file.name
+    return [answer]
 
 
 def lines(answer: dict[str, Any], lang: str) -> Iterator[str]:
@@ -54,6 +91,8 @@ def lines(answer: dict[str, Any], lang: str) -> Iterator[str]:
     values = {"duration": record["duration_s"], **record, "axis": answer["axis"]}
     yield render(f"diagnosis.{what}", values, lang)
     yield f"{render('diagnosis.word.' + answer['verdict'], {}, lang)}  {answer['sentence']}"
+    for done in answer.get("experiments", ()):
+        yield render("diagnosis.done", {"sentence": done["sentence"]}, lang)
     yield from head("checks", [check["sentence"] for check in answer["checks"] if not check["ok"]])
     yield from head("fails", [failure["sentence"] for failure in answer["where_it_fails"]])
     yield from head("evidence", [finding["sentence"] for finding in answer["missing"]])
