@@ -1,6 +1,12 @@
 """HTTP under /api/v1: one router a noun."""
 
-from server.api import (
+import sys
+
+# FastAPI looks, at every route, whether a model is one of pydantic 1's, and takes "not installed" for a no. None here
+# is; importing that package would be a tenth of the server's start-up.
+sys.modules.setdefault("pydantic.v1", None)  # type: ignore[arg-type]
+
+from server.api import (  # noqa: E402
     boards,
     certificates,
     diagnoses,

@@ -42,11 +42,11 @@ Speed = Annotated[float, Field(ge=1, le=1000)] | Literal["max"]
 class Body(BaseModel):
     """What a client sends: nothing unknown, no infinities, no text where a number is asked."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True, defer_build=True)
 
 
 class Answer(BaseModel):
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(extra="allow", defer_build=True)
 
 
 # --- boards and gyro models ------------------------------------------------------------------------------------
