@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from calib_core.effects import library
 from calib_core.problem import Problem
 
 Values = dict[str, float]
@@ -113,6 +112,8 @@ def checked(name: str, values: Mapping[str, float]) -> Values:
     """Parameters as a person gave them. Raises Problem for an effect, a parameter or a size that cannot be."""
     if name not in SCALE:
         raise Problem("effects.not_hidden", given=name, allowed=", ".join(SCALE))
+    from calib_core.effects import library
+
     known = library()[name].parameters()
     for parameter, value in values.items():
         if parameter not in known:

@@ -24,6 +24,9 @@ LAZY = {
     "nidaqmx",
     "grpc",
     "cryptography",
+    "calib_core.effects",
+    "calib_core.experiment",
+    "calib_core.gap",
 }
 SOURCES = sorted([*ROOT.glob("calib_core/**/*.py"), *ROOT.glob("server/**/*.py")])
 

@@ -7,10 +7,9 @@ from fastapi import APIRouter, Depends, Header, Path
 from fastapi.responses import Response
 from pydantic import AfterValidator, BaseModel, Field
 
-from calib_core.effects import library
 from calib_core.problem import Problem
 from calib_core.strengths import DIFFICULTIES, SCALE, STRONGEST
-from server import experiments, lab_bench, lab_grading, texts
+from server import experiments, lab_grading, texts
 from server.api import models
 from server.api.common import Cursor, Here, Language, Limit, Services
 from server.api.notebooks import Effects, Name, Numbers, Text
@@ -164,6 +163,8 @@ Code = Annotated[str, Depends(_code)]
 
 
 def exercise(here: Services, code: str) -> dict[str, Any]:
+    from server import lab_bench
+
     shown = here.store.lab.exercise(code)
     offers = [
         {"name": name, "motion": [step.to_json() for step in steps]}
@@ -212,6 +213,8 @@ def _grade(truth: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
 # --- for everybody -----------------------------------------------------------------------------------------------
 @router.post("", status_code=201, summary="Hide something, or nothing, in a bench", responses=declared(409))
 async def create(body: ExerciseBody, here: Here) -> Made:
+    from server import lab_bench
+
     seed = secrets.randbits(53) if body.seed is None else body.seed
     chosen = [one.model_dump() for one in body.effects]
     if body.difficulty is not None and chosen:
@@ -241,6 +244,8 @@ def one(code: Code, here: Here) -> Exercise:
 # --- for students ------------------------------------------------------------------------------------------------
 @router.post("/{code}/students", status_code=201, summary="Join with a name", responses=declared(404, 409))
 async def join(code: Code, body: StudentBody, here: Here, lang: Language) -> Student:
+    from server import lab_bench
+
     who = here.store.lab.join(code, body.name)
     known = here.store.lab.exercise(code)
     if known["starter"]:
@@ -256,6 +261,8 @@ def own(code: Code, who: str, here: Here, lang: Language) -> Student:
 
 @router.post("/{code}/students/{who}/plan", summary="What a motion would do, before it is run", responses=declared(404))
 def plan(code: Code, who: str, body: MotionBody, here: Here, lang: Language) -> Preview:
+    from server import lab_bench
+
     here.store.lab.student(code, who)
     motion = [one.model_dump() for one in body.motion]
     shown = lab_bench.preview(motion, here.store.lab.exercise(code)["axis"])
@@ -269,6 +276,8 @@ def plan(code: Code, who: str, body: MotionBody, here: Here, lang: Language) -> 
     responses=declared(404, 409),
 )
 async def run(code: Code, who: str, body: RunBody, here: Here, lang: Language) -> OwnRun:
+    from server import lab_bench
+
     here.store.lab.student(code, who)
     motion = [one.model_dump() for one in body.motion]
     made = await here.compute.run(lab_bench.run, here.store.data, code, who, motion, body.joins, body.restart)
@@ -277,6 +286,9 @@ async def run(code: Code, who: str, body: RunBody, here: Here, lang: Language) -
 
 @router.put("/{code}/students/{who}/answer", summary="Hand in an answer", responses=declared(404, 409))
 async def answer(code: Code, who: str, body: AnswerBody, here: Here, lang: Language) -> Student:
+    from calib_core.effects import library
+    from server import lab_bench
+
     row = here.store.lab.student(code, who)
     if here.store.lab.exercise(code)["revealed_at"]:
         raise Problem("lab.revealed")

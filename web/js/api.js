@@ -27,8 +27,8 @@ export class Refused extends Error {
   }
 }
 
-async function call(method, path, body) {
-  const headers = { "Accept-Language": language };
+async function call(method, path, body, { as = "json", ...more } = {}) {
+  const headers = { "Accept-Language": language, ...more };
   const token = localStorage.getItem(TOKEN);
   const lease = sessionStorage.getItem(LEASE);
   if (token) headers.Authorization = `Bearer ${token}`;
@@ -42,6 +42,7 @@ async function call(method, path, body) {
     throw new Refused({ detail: t("page.unreachable") }, 0);
   }
   if (answer.status === 204) return null;
+  if (answer.ok && as === "blob") return answer.blob();
   const content = await answer.json().catch(() => ({}));
   if (answer.ok) return content;
   const refused = new Refused(content, answer.status);
@@ -118,6 +119,20 @@ export const api = {
   notebook: (notebook) => call("GET", `/notebooks/${id(notebook)}`),
   writeNotebook: (notebook, line) => call("POST", `/notebooks/${id(notebook)}/lines`, line),
 
+  effects: () => call("GET", "/effects"),
+  hideable: () => call("GET", "/lab/effects"),
+  createExercise: (body) => call("POST", "/lab", body),
+  exercise: (code) => call("GET", `/lab/${id(code)}`),
+  joinExercise: (code, name) => call("POST", `/lab/${id(code)}/students`, { name }),
+  student: (code, who) => call("GET", `/lab/${id(code)}/students/${id(who)}`),
+  labPlan: (code, who, motion) => call("POST", `/lab/${id(code)}/students/${id(who)}/plan`, { motion }),
+  labRun: (code, who, body) => call("POST", `/lab/${id(code)}/students/${id(who)}/runs`, body),
+  labAnswer: (code, who, body) => call("PUT", `/lab/${id(code)}/students/${id(who)}/answer`, body),
+  labResults: (code, key, q) => call("GET", `/lab/${id(code)}/results${query(q)}`, undefined, { "X-Lab-Key": key }),
+  labTable: (code, key) => call("GET", `/lab/${id(code)}/results.csv`, undefined, { "X-Lab-Key": key, as: "blob" }),
+  reveal: (code, key) => call("POST", `/lab/${id(code)}/reveal`, undefined, { "X-Lab-Key": key }),
+  deleteExercise: (code, key) => call("DELETE", `/lab/${id(code)}`, undefined, { "X-Lab-Key": key }),
+
   thesis: () => call("GET", "/thesis"),
   useToken: (token) => localStorage.setItem(TOKEN, token),
 };
@@ -127,6 +142,8 @@ export const links = {
   recording: (recording, kind = "csv") => `${ROOT}/recordings/${id(recording)}.${kind}`,
   document: (number, kind) => `${ROOT}/certificates/${id(number)}.${kind}${kind === "pdf" ? query({ lang: language }) : ""}`,
   notebook: (notebook) => `${ROOT}/notebooks/${id(notebook)}.pdf${query({ lang: language })}`,
+  lab: (code, key = null) => `/lab.html${query({ code })}${key ? `#key=${id(key)}` : ""}`,
+  workbench: (recording, axis, more = {}) => `/workbench.html${query({ recording, axis, ...more })}`,
   run: (run) => `/run.html${query({ id: run })}`,
   board: (board) => `/boards.html${query({ id: board })}`,
   compare: (a, b) => `/compare.html${query({ a, b })}`,

@@ -1,7 +1,7 @@
 // The lab notebook beside a page: writes lines in their order, shows them, and gives the PDF.
 //
-// notebook() -> {write, panel, id}: the notebook of the address (?notebook=…), else this browser's own, begun with its
-// first line. Lines stay: there is nothing here that changes or deletes one.
+// notebook() -> {write, panel, refresh, id}: the notebook `id`, else that of the address (?notebook=…), else this
+// browser's own, begun with its first line. Lines stay: there is nothing here that changes or deletes one.
 
 import { api, links } from "./api.js";
 import { h, say } from "./dom.js";
@@ -9,8 +9,8 @@ import { clock, t } from "./text.js";
 
 const OWN = "gyrobench.notebook";
 
-export function notebook({ title = "", author = "" } = {}) {
-  const given = new URLSearchParams(location.search).get("notebook");
+export function notebook({ id: known = null, title = "", author = "" } = {}) {
+  const given = known ?? new URLSearchParams(location.search).get("notebook");
   let id = given ?? localStorage.getItem(OWN);
   let queue = Promise.resolve();
   const lines = [];
@@ -53,6 +53,8 @@ export function notebook({ title = "", author = "" } = {}) {
       queue = queue.then(() => append(line));
       return queue;
     },
+    /** Reads again what stands in it: the server writes some lines itself. */
+    refresh() { queue = queue.then(load); },
     /** Shows the lines in `place`, with a field for a note and the PDF. */
     panel(place) {
       const list = h("ol", { class: "lines", tabindex: "0", "aria-label": t("notebook.title") });
