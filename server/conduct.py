@@ -26,6 +26,7 @@ from server.live import LiveRun
 from server.live_analysis import LiveAnalyser
 from server.store import Store
 from server.store_db import now
+from server.store_runs import INTERRUPTED
 
 log = logging.getLogger("gyrobench.run")
 PAUSE_S = 1.0  # between the kept states' last sample and the first of a run that continues them
@@ -39,14 +40,18 @@ def conduct(
     speed: float,
     abort: threading.Event,
     live: LiveRun | None = None,
+    lost: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Runs a queued run to its end; gives {"status", "message": {"code", "values"} | None, "certificate", "states"}.
 
-    ``rig`` gives the rig, opened or not. Does not raise what ends a run: that is its message.
+    ``rig`` gives the rig, opened or not; ``lost`` says whether nobody asked for a stop, but whoever started the run
+    is gone. Does not raise what ends a run: that is its message.
     """
     last: dict[str, Any] = {"status": "failed", "message": None, "certificate": None}
     try:
         last = _Conductor(store, run, rig(), speed, abort, live).conduct()
+        if last["status"] == "stopped" and lost():
+            last |= {"status": "interrupted", "message": INTERRUPTED}
     except Problem as problem:
         last["message"] = _message(problem)
     except Exception as error:

@@ -115,6 +115,11 @@ def _lab(db: Database) -> None:
     db.table("lab_runs").create_index(["student"])
 
 
+@migrations(name="0010_owners")
+def _owners(db: Database) -> None:
+    db.table("runs").add_column("owner", str)
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

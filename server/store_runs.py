@@ -1,6 +1,7 @@
 """Runs: what was asked, how far it went, what each state gave."""
 
 import json
+import os
 import secrets
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ SELECT = "select rowid as at, * from runs"
 JSON_COLUMNS = ("request", "plan", "states", "message")
 SEARCHED = ("board", "json_extract(request, '$.operator')", "json_extract(request, '$.note')")
 ENDED = ("finished", "stopped", "failed", "interrupted")
+INTERRUPTED = {"code": "run.interrupted", "values": {}}
 
 
 class Runs:
@@ -35,7 +37,7 @@ class Runs:
             "id": run, "board": board, "gyro_model": gyro_model, "profile": profile, "status": "queued",
             "recording": recording, "certificate": None, "request": dumps(dict(request)), "plan": dumps(dict(plan)),
             "states": dumps([{"name": name, "status": "waiting"} for name in states]), "message": None,
-            "created_at": now(), "started_at": None, "finished_at": None,
+            "created_at": now(), "started_at": None, "finished_at": None, "owner": _this_process(),
         }  # fmt: skip
         with self._at.write() as db:
             db.table("runs").insert(row)
@@ -66,7 +68,7 @@ class Runs:
 
     def start(self, run: str) -> None:
         with self._at.write() as db:
-            db.table("runs").update(run, {"status": "running", "started_at": now()})
+            db.table("runs").update(run, {"status": "running", "started_at": now(), "owner": _this_process()})
 
     def set_state(self, run: str, state: str, status: str) -> None:
         """``status``: waiting, running, done, failed or kept (taken over from the run that this one continues)."""
@@ -89,11 +91,15 @@ class Runs:
             db.table("runs").update(run, {**changes, "message": dumps(message) if message else None})
 
     def interrupt_open(self) -> list[str]:
-        """Runs that say they are on though nothing runs them (the program was ended): mark them, keep their samples."""
-        open_runs = [row["id"] for row in self._at.rows("select id from runs where status in ('queued', 'running')")]
-        for run in open_runs:
-            self.finish(run, "interrupted", message={"code": "run.interrupted", "values": {}})
-        return open_runs
+        """Runs that say they are on though nothing runs them (the program was ended): mark them, keep their samples.
+
+        Another program that lives may be running its own in the same store: that one is left alone.
+        """
+        rows = self._at.rows("select id, owner from runs where status in ('queued', 'running')")
+        lost = [row["id"] for row in rows if not _lives_elsewhere(row["owner"])]
+        for run in lost:
+            self.finish(run, "interrupted", message=INTERRUPTED)
+        return lost
 
     def set_result(self, run: str, state: str, result: Mapping[str, Any]) -> None:
         with self._at.write() as db:
@@ -110,4 +116,25 @@ class Runs:
 
 
 def _shown(row: Row) -> Row:
-    return {**row, **{name: None if row[name] is None else json.loads(row[name]) for name in JSON_COLUMNS}}
+    shown = {name: value for name, value in row.items() if name != "owner"}
+    return {**shown, **{name: None if row[name] is None else json.loads(row[name]) for name in JSON_COLUMNS}}
+
+
+def _this_process() -> str:
+    """Its number, and when it began: numbers are used again."""
+    import psutil
+
+    return f"{os.getpid()} {psutil.Process().create_time():.0f}"
+
+
+def _lives_elsewhere(owner: str | None) -> bool:
+    """Whether a process other than this one, of this number and begun then, still runs."""
+    import psutil
+
+    number, _, began = (owner or "").partition(" ")
+    if not began or int(number) == os.getpid():
+        return False
+    try:
+        return f"{psutil.Process(int(number)).create_time():.0f}" == began
+    except psutil.Error:
+        return False

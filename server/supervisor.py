@@ -18,6 +18,7 @@ from server import worker
 from server.live import ENDED, LiveRun, decode
 from server.settings import Settings
 from server.store import Store
+from server.store_runs import INTERRUPTED
 
 log = logging.getLogger("gyrobench")
 KEPT_RUNS = 4  # live runs that a page may still want after their end
@@ -217,12 +218,11 @@ class Supervisor:
             self._interrupt(self.run)
 
     def _interrupt(self, run: str) -> None:
-        message = {"code": "run.interrupted", "values": {}}
         try:
-            self._store.runs.finish(run, "interrupted", message=message)
+            self._store.runs.finish(run, "interrupted", message=INTERRUPTED)
         except Problem:
             log.exception("run %s cannot be marked as interrupted; the next start does it", run)
-        self._ended(run, {"status": "interrupted", "message": message})
+        self._ended(run, {"status": "interrupted", "message": INTERRUPTED})
 
     def _ended(self, run: str, last: Mapping[str, Any]) -> None:
         if self.run == run:

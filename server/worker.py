@@ -52,6 +52,7 @@ class Worker:
         self._checking = False
         self._commands: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._abort = threading.Event()
+        self._orphaned = False  # the server is gone without a word
         self._telling = threading.Lock()
 
     def serve(self) -> None:
@@ -92,6 +93,7 @@ class Worker:
             try:
                 command = self._pipe.recv()
             except (EOFError, OSError):
+                self._orphaned = True
                 command = ("quit",)
             match command:
                 case ("stop", int(number)):
@@ -191,7 +193,9 @@ class Worker:
         sender = threading.Thread(target=self._send_frames, args=(live, news, done), name="frames")
         sender.start()
         try:
-            last = conduct(self._store, run, self._opened, speed=speed, abort=self._abort, live=live)
+            last = conduct(
+                self._store, run, self._opened, speed=speed, abort=self._abort, live=live, lost=lambda: self._orphaned
+            )
         finally:
             done.set()
             news.set()

@@ -1,9 +1,14 @@
-"""The chart library is served from the installed package: these are the very files that were looked at."""
+"""What is installed is what was looked at: the chart library's very files, and the versions that pyproject pins."""
 
 import hashlib
+import tomllib
+from importlib.metadata import distributions
 from importlib.resources import files
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from shared import ROOT
 
 
 @pytest.mark.parametrize(
@@ -16,3 +21,11 @@ import pytest
 def test_uplot_is_the_pinned_one(name: str, digest: str) -> None:
     content = files("youplot").joinpath("vendor", name).read_bytes()
     assert hashlib.sha256(content).hexdigest() == digest
+
+
+def test_every_installed_package_is_pinned() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    pinned = {r.name: r.specifier for r in map(Requirement, settings["tool"]["uv"]["constraint-dependencies"])}
+    found = {canonicalize_name(d.metadata["Name"]): d.version for d in distributions()}
+    del found["gyrobench"]
+    assert [f"{name}=={found[name]}" for name in found if name not in pinned or found[name] not in pinned[name]] == []

@@ -2,6 +2,8 @@
 
 import multiprocessing
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +194,24 @@ def test_open_runs_are_marked_as_interrupted_and_keep_their_samples(store: Store
     assert row["states"] == [{"name": "estimate_x", "status": "failed"}]
     assert len(store.recording(made)) == 500
     assert store.runs.interrupt_open() == []
+
+
+def test_a_run_of_another_program_that_lives_is_left_alone(store: Store, tmp_path: Path) -> None:
+    script = (
+        "import sys; from server.store import Store; store = Store(sys.argv[1]);"
+        "made = store.recordings.create(board='B', name='B', source='run', header={});"
+        "print(store.runs.create(board='B', gyro_model='M', profile='standard', recording=made, request={}, plan={},"
+        " states=[]), flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        run = other.stdout.readline().strip()
+        assert store.runs.interrupt_open() == []
+        assert store.runs.get(run)["status"] == "queued"
+        other.kill()
+    assert store.runs.interrupt_open() == [run]
 
 
 # --- boards, models, lists -------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ def run(*, quick: bool) -> list[Row]:
 
 def soak(seconds: float = SOAK_S) -> list[Row]:
     """Both devices for `seconds`, both axes swinging: nothing lost, memory flat, the clocks as they truly are."""
-    import psutil  # type: ignore[import-untyped]
+    import psutil
 
     from calib_core.sequence import Move, Wave
 
