@@ -166,6 +166,15 @@ def diagnose(
         return diagnosis.of_recording(store.recording(recording), **asked, axes=rig or None)
 
 
+def example(data: Path, name: str) -> str:
+    """Makes an example's recording, unless it is there; gives its id."""
+    from server import examples
+    from server.store import Store
+
+    with Store(data) as store:
+        return examples.made(store, name)
+
+
 def verify(data: Path, number: str) -> dict[str, Any]:
     from server import certify as room
     from server.store import Store

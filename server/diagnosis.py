@@ -131,10 +131,10 @@ def explained(answer: Words) -> Words:
     tied = {name: names for names in answer["rivals"] for name in names}
     tested = sum(candidate["status"] == "tested" for candidate in answer["candidates"]) or 1
     for failure in answer["where_it_fails"]:
-        failure |= _failure(failure)
+        failure |= failing(failure)
     for finding in answer["missing"]:
         names = tied.get(finding["effect"], [finding["effect"]])
-        finding |= _finding(effect_words(names), min(1.0, finding["p"] * tested))
+        finding |= certainty(effect_words(names), min(1.0, finding["p"] * tested))
     if answer["error"] is not None:
         answer |= _verdict(answer, tied)
     return dict(plain(answer | {"limits": list(_limits(answer))}))
@@ -193,7 +193,7 @@ def errors(answer: Words) -> tuple[float, float, float, str]:
     return before, after, floor, unit
 
 
-def _failure(failure: Mapping[str, Any]) -> Words:
+def failing(failure: Mapping[str, Any]) -> Words:
     suffix = "deg" if "residual_deg" in failure else "dps"
     residual, z = failure[f"residual_{suffix}"], failure["z"]
     low, high = failure["from"], failure["to"]
@@ -212,7 +212,7 @@ def _failure(failure: Mapping[str, Any]) -> Words:
     return {"code": f"diagnosis.{side}", "values": {"size": size, "unit": unit, "where": where}}
 
 
-def _finding(effect: Words, chance: float) -> Words:
+def certainty(effect: Words, chance: float) -> Words:
     word = "certain" if chance < CERTAIN else "likely" if chance < LIKELY else "probable"
     values = {"effect": effect} | ({"odds": _round_number(1.0 / chance)} if word == "likely" else {})
     return {"code": f"diagnosis.finding.{word}", "values": values}

@@ -20,6 +20,7 @@ from server.api import (  # noqa: E402
     rig,
     runs,
     thesis,
+    workbench,
 )
 
 ROUTERS = (
@@ -31,6 +32,7 @@ ROUTERS = (
     live.router,
     recordings.router,
     diagnoses.router,
+    workbench.router,
     experiments.router,
     notebooks.router,
     lab.router,

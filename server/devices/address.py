@@ -12,6 +12,7 @@ from server.devices.dynamixel_table import DynamixelTable
 from server.devices.ni_daq import NiDaq
 from server.devices.rig import Rig
 from server.devices.twin_rig import TwinDaq, TwinTable
+from server.examples import by_board
 
 TWIN = "twin:?seed=1"
 BENCH = "dynamixel:PORT?ids=1,2&baud=1000000+nidaq:Dev1?channels=ai0,ai1"
@@ -92,7 +93,8 @@ def _twin(url: str, rest: str) -> Rig:
 
     def mount(board: str, gyro_model: GyroModel) -> None:
         with table.lock:
-            plant.mount(with_effects(board_truth(seed, board, gyro_model), effects))
+            example = by_board(board)
+            plant.mount(example.truth() if example else with_effects(board_truth(seed, board, gyro_model), effects))
 
     one_way_s = plant.daq.spec.transfer_s + LATCH_S
     return Rig(
