@@ -26,6 +26,8 @@ WARM = 3
 """So many recordings stay ready; one of 22 000 samples takes some 40 MB."""
 UNSHAPED = ("adc_quantization", "bias_random_walk", "input_loading", "mains_hum", "saturation")
 """Effects that have a test of their own and no shape that a fit could add."""
+PATH_HZ = 25.0
+"""Fine enough to draw a motion of 4 Hz."""
 _warm: OrderedDict[tuple[Path, str, str], Workbench] = OrderedDict()
 
 
@@ -156,6 +158,17 @@ def suspects(data: Path, recording: str, axis: str, effects: Sequence[str], lang
     return dict(diagnosis.plain({**verdict, "threshold": bench.threshold, "suspects": order}))
 
 
+def path(motion: Sequence[Mapping[str, Any]]) -> Words:
+    """Times and commanded angles of the axes that a motion moves; the first axis alone where none does."""
+    from calib_core.excitation import Excitation, commanded, steps
+
+    planned = steps([Excitation.from_json(one) for one in motion], "path")
+    angles = commanded(planned, PATH_HZ)
+    moved = [axis for axis, values in angles.items() if np.ptp(values) > 0.0] or [motion[0]["axis"]]
+    time = np.arange(len(next(iter(angles.values())))) / PATH_HZ
+    return {"time_s": time.tolist(), "angle_deg": {axis: np.round(angles[axis], 3).tolist() for axis in moved}}
+
+
 def _row(candidate: Mapping[str, Any]) -> Words:
     z = _z(candidate["p"], candidate["two_delta_lnL"]) if candidate["status"] == "tested" else None
     return {**candidate, "z": z}
@@ -181,7 +194,8 @@ def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
     if (row["z"] or 0.0) < threshold and name not in UNSHAPED:
         return {"word": "nothing", "code": "workbench.evidence.nothing", "values": {}}
     chance = 0.0 if row["p"] is None else min(1.0, row["p"] * tested)
-    return diagnosis.certainty(diagnosis.effect_words([name]), chance)
+    found = diagnosis.certainty(diagnosis.effect_words([name]), chance)
+    return {"word": found["code"].rpartition(".")[2], **found}
 
 
 def _kind(name: str) -> str:

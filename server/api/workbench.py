@@ -61,6 +61,13 @@ class Suspects(Answer):
     suspects: list[Suspect]
 
 
+class Path(BaseModel):
+    """Where the axes that move are sent."""
+
+    time_s: list[float]
+    angle_deg: dict[str, list[float]]
+
+
 class Example(BaseModel):
     name: str
     title: str
@@ -122,6 +129,11 @@ async def suspects(
     names = tuple(filter(None, effects.split(",")))
     answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, lang)
     return Suspects.model_validate(answer)
+
+
+@router.get("/experiments/{experiment}/motion", summary="An experiment's motion, to be drawn", responses=declared(404))
+def motion(experiment: str, here: Here) -> Path:
+    return Path(**workbench.path(here.store.experiments.get(experiment)["proposal"]["motion"]))
 
 
 @router.get("/examples", summary="Recordings to learn on")

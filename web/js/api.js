@@ -1,5 +1,6 @@
 // The one module that knows addresses.
 
+import { decode } from "./columns.js";
 import { language, t } from "./text.js";
 
 const ROOT = "/api/v1";
@@ -43,6 +44,7 @@ async function call(method, path, body, { as = "json", ...more } = {}) {
   }
   if (answer.status === 204) return null;
   if (answer.ok && as === "blob") return answer.blob();
+  if (answer.ok && answer.headers.get("Content-Type") === "application/octet-stream") return decode(await answer.arrayBuffer());
   const content = await answer.json().catch(() => ({}));
   if (answer.ok) return content;
   const refused = new Refused(content, answer.status);
@@ -132,6 +134,19 @@ export const api = {
   labTable: (code, key) => call("GET", `/lab/${id(code)}/results.csv`, undefined, { "X-Lab-Key": key, as: "blob" }),
   reveal: (code, key) => call("POST", `/lab/${id(code)}/reveal`, undefined, { "X-Lab-Key": key }),
   deleteExercise: (code, key) => call("DELETE", `/lab/${id(code)}`, undefined, { "X-Lab-Key": key }),
+  recordings: (q) => call("GET", `/recordings${query(q)}`),
+  recording: (recording) => call("GET", `/recordings/${id(recording)}`),
+  examples: () => call("GET", "/examples"),
+  makeExample: (name) => call("POST", `/examples/${id(name)}`),
+  signal: (recording, q) => call("GET", `/recordings/${id(recording)}/signal${query(q)}`),
+  fit: (recording, body) => call("POST", `/recordings/${id(recording)}/fit`, body),
+  suspects: (recording, { axis, effects }) => call("GET", `/recordings/${id(recording)}/suspects${query({ axis, effects: effects.join(",") })}`),
+  keepEffect: (own) => call("POST", "/effects", own),
+  saveModel: (body) => call("POST", "/models", body),
+  experimentMotion: (experiment) => call("GET", `/experiments/${id(experiment)}/motion`),
+  proposeExperiment: (body) => call("POST", "/experiments", body),
+  experiment: (experiment) => call("GET", `/experiments/${id(experiment)}`),
+  runExperiment: (experiment) => call("POST", `/experiments/${id(experiment)}/run`, {}),
 
   thesis: () => call("GET", "/thesis"),
   useToken: (token) => localStorage.setItem(TOKEN, token),
@@ -144,6 +159,8 @@ export const links = {
   notebook: (notebook) => `${ROOT}/notebooks/${id(notebook)}.pdf${query({ lang: language })}`,
   lab: (code, key = null) => `/lab.html${query({ code })}${key ? `#key=${id(key)}` : ""}`,
   workbench: (recording, axis, more = {}) => `/workbench.html${query({ recording, axis, ...more })}`,
+  model: (model, kind) => `${ROOT}/models/${id(model)}.${kind}`,
+  drawing: (effect) => `/effects/${id(effect)}.svg`,
   run: (run) => `/run.html${query({ id: run })}`,
   board: (board) => `/boards.html${query({ id: board })}`,
   compare: (a, b) => `/compare.html${query({ a, b })}`,

@@ -1,12 +1,14 @@
 // The one module that knows uPlot. A chart is a figure: name, readout, plot.
 //
-// chart(place, {name, x, y, series, group, height, frame}) -> {set, clear, destroy}
-//   x, y      {label, unit, digits, zero, min, max}
-//   series    [{name, role: measured|model|residual, draw: line|dash|dots|points|stems, digits}]
-//   group     charts of one group share zoom and cursor
-// set([xs, ys…], {from, to, band})  band: half-width of a shaded strip around zero.
+// chart(place, {name, x, y, series, group, height, tight, onZoom}) -> {set, rename, destroy}
+//   x, y      {label, unit, digits, zero, min, max, log, bare}; bare: the axis shows its unit alone
+//   series    [{name, role: measured|model|residual, draw: line|dash|dots|points|faint|dust|stems, joined, digits}]
+//   group     charts of one group share zoom and cursor; onZoom([from, to] or null) hears of it
+//   tight     no room for names at the ends of lines
+// set([xs, ys…], {from, to, band, shade, limits})  band: half-width of a shaded strip around zero, or {x, half} along x;
+//   shade: [[from, to]…], stretches to look at; limits: [lowest, highest] of y.
 
-import { fixed, t } from "./text.js";
+import { fixed, plain, t } from "./text.js";
 
 const colours = new Map();
 function colour(name) {
@@ -45,13 +47,14 @@ function stems(plot, index, first, last) {
   return { stroke: path };
 }
 
-function seriesOptions({ role, draw }) {
+function seriesOptions({ role, draw, joined = false }) {
   const stroke = () => colour(role);
   const dots = (size) => ({ show: true, size, fill: stroke, stroke, width: 0 });
   if (draw === "points") return { stroke, paths: () => null, points: dots(6) };
+  if (draw === "dust") return { stroke: () => colour(`${role}-dust`), paths: () => null, points: { show: true, size: 3, width: 0, fill: () => colour(`${role}-dust`) } };
   if (draw === "faint") return { stroke, paths: () => null, points: { show: true, size: 4, width: 1, fill: () => colour("paper"), stroke } };
   if (draw === "stems") return { stroke, width: 1.5, paths: stems, points: dots(6) };
-  return { stroke, width: 1.5, dash: DASH[draw], points: { show: false } };
+  return { stroke, width: 1.5, dash: DASH[draw], points: { show: false }, spanGaps: joined };
 }
 
 /** Names stand at the ends of their lines; where lines meet, names are moved apart. */
@@ -97,7 +100,19 @@ function drawBack(plot, spec, state) {
   ctx.beginPath();
   ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
   ctx.clip();
-  if (state.band) {
+  for (const [from, to] of state.shade) {
+    const [left, right] = [plot.valToPos(from, "x", true), plot.valToPos(to, "x", true)];
+    ctx.fillStyle = colour("look-soft");
+    ctx.fillRect(left, bbox.top, Math.max(right - left, 2), bbox.height);
+  }
+  if (state.band?.x) {
+    const { x, half } = state.band;
+    ctx.fillStyle = colour("band");
+    ctx.beginPath();
+    for (let i = 0; i < x.length; i++) ctx.lineTo(plot.valToPos(x[i], "x", true), plot.valToPos(half[i], "y", true));
+    for (let i = x.length - 1; i >= 0; i--) ctx.lineTo(plot.valToPos(x[i], "x", true), plot.valToPos(-half[i], "y", true));
+    ctx.fill();
+  } else if (state.band) {
     const top = plot.valToPos(state.band, "y", true);
     ctx.fillStyle = colour("band");
     ctx.fillRect(bbox.left, top, bbox.width, plot.valToPos(-state.band, "y", true) - top);
@@ -116,7 +131,9 @@ function drawBack(plot, spec, state) {
 
 function yRange(spec, state, low, high) {
   if (low == null) return [spec.y.min ?? -1, spec.y.max ?? 1];
-  const reach = state.band ?? 0;
+  if (state.limits) return state.limits;
+  if (spec.y.log) return [10 ** Math.floor(Math.log10(low)), 10 ** Math.ceil(Math.log10(high))];
+  const reach = state.band?.x ? Math.max(0, ...state.band.half) : state.band ?? 0;
   let [from, to] = [Math.min(low, -reach || low), Math.max(high, reach || high)];
   if (spec.y.zero) [from, to] = [Math.min(from, 0), Math.max(to, 0)];
   // A nearly constant signal must not fill the picture with its last digit.
@@ -125,7 +142,7 @@ function yRange(spec, state, low, high) {
   return [from - pad, to + pad];
 }
 
-const axisLabel = ({ label, unit }) => (unit ? `${label}, ${unit}` : label);
+const axisLabel = ({ label, unit, bare }) => (bare ? unit : unit ? `${label}, ${unit}` : label);
 
 export function chart(place, spec) {
   const figure = document.createElement("figure");
@@ -140,11 +157,11 @@ export function chart(place, spec) {
   waiting.textContent = spec.waiting ?? "";
   place.append(figure);
 
-  const state = { band: null, range: null, zoom: null };
+  const state = { band: null, shade: [], limits: null, range: null, zoom: null };
   const group = spec.group ?? Symbol("alone");
   if (!groups.has(group)) groups.set(group, new Set());
   // Pictures above each other share their time axis, so their names get the same room.
-  const room = Math.max(innerWidth > 720 ? 92 : 0, ...spec.series.map((series) => (series.name ? widthOf(series.name) + 26 : 8)));
+  const room = spec.tight ? 16 : Math.max(innerWidth > 720 ? 92 : 0, ...spec.series.map((series) => (series.name ? widthOf(series.name) + 26 : 8)));
   let plot = null;
 
   function zoom(range) {
@@ -154,6 +171,7 @@ export function chart(place, spec) {
     zoom(range) {
       state.zoom = range;
       if (plot) plot.setScale("x", between());
+      spec.onZoom?.(range);
     },
   };
   groups.get(group).add(self);
@@ -185,10 +203,10 @@ export function chart(place, spec) {
     });
     plot = new uPlot({
       width: box.clientWidth, height: box.clientHeight, padding: [8, room, 0, 0], legend: { show: false },
-      scales: { x: { time: false }, y: { range: (_, low, high) => yRange(spec, state, low, high) } },
+      scales: { x: { time: false, distr: spec.x.log ? 3 : 1 }, y: { distr: spec.y.log ? 3 : 1, range: (_, low, high) => yRange(spec, state, low, high) } },
       axes: [
-        axis({ label: axisLabel(spec.x), size: 26, values: (_, ticks) => ticks.map((tick) => fixed(tick, step(ticks))) }),
-        axis({ label: axisLabel(spec.y), size: 52, values: (_, ticks) => ticks.map((tick) => fixed(tick, step(ticks))) }),
+        axis({ label: axisLabel(spec.x), size: 26, values: (_, ticks) => tickWords(ticks, spec.x.log) }),
+        axis({ label: axisLabel(spec.y), size: 52, values: (_, ticks) => tickWords(ticks, spec.y.log) }),
       ],
       series: [{}, ...spec.series.map(seriesOptions)],
       cursor: {
@@ -231,8 +249,8 @@ export function chart(place, spec) {
   });
 
   return {
-    set(data, { from, to, band = null } = {}) {
-      Object.assign(state, { band, range: from === undefined ? null : [from, to] });
+    set(data, { from, to, band = null, shade = [], limits = null } = {}) {
+      Object.assign(state, { band, shade, limits, range: from === undefined ? null : [from, to] });
       const isEmpty = data[0].length === 0;
       waiting.hidden = !isEmpty;
       if (!plot) {
@@ -259,6 +277,8 @@ export function chart(place, spec) {
     },
   };
 }
+
+const tickWords = (ticks, isLog) => ticks.map((tick) => (tick == null ? "" : isLog ? plain(tick) : fixed(tick, step(ticks))));
 
 /** Decimals that the distance between ticks asks for. */
 function step(ticks) {

@@ -1,27 +1,13 @@
 // A run as it happens: frames from the websocket, kept as typed columns; the page redraws from them.
 
 import { links } from "./api.js";
+import { decode } from "./columns.js";
 import { clock, t } from "./text.js";
 
 const ROWS = 8192;      // more than two minutes at 50 rows/s
 const RETRY_MS = [500, 1000, 2000, 4000];
 const NO_SUCH_RUN = 4404;
 const ENDED = new Set(["finished", "stopped", "failed", "interrupted"]);
-
-/** u32 length, JSON, then Float64 arrays back to back in the order of `arrays`. */
-export function decode(buffer) {
-  const length = new DataView(buffer).getUint32(0, true);
-  const frame = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  // The arrays start at a multiple of 8 after the length; a copy puts them at one in memory too.
-  const arrays = buffer.slice(4 + length);
-  let at = 0;
-  frame.columns = {};
-  for (const [name, count] of frame.arrays ?? []) {
-    frame.columns[name] = new Float64Array(arrays, at, count);
-    at += 8 * count;
-  }
-  return frame;
-}
 
 /** The newest rows of one column, contiguous in memory: filled to the end, then the newest half moves to the front. */
 export class Column {

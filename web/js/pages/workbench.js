@@ -1,0 +1,183 @@
+// The workbench: compare, see, learn, add, and watch the error fall.
+
+import { api, links } from "../api.js";
+import { h, say } from "../dom.js";
+import { notebook } from "../notebook.js";
+import { page } from "../shell.js";
+import { duration, t } from "../text.js";
+import { showCard } from "../workbench/card.js";
+import { experimentPanel, onRig } from "../workbench/experiment.js";
+import { formulaForm } from "../workbench/formula.js";
+import { guessForm } from "../workbench/guess.js";
+import { keepPanel } from "../workbench/keep.js";
+import { ledger } from "../workbench/ledger.js";
+import { pictures } from "../workbench/pictures.js";
+import { choose } from "../workbench/start.js";
+import { showSuspects } from "../workbench/suspects.js";
+
+const GUESS_FIRST = "gyrobench.guess-first";
+const asked = new URLSearchParams(location.search);
+/** What goes on from recording to recording: the blind lab's code and its notebook. */
+const carried = Object.fromEntries(["lab", "notebook"].filter((key) => asked.has(key)).map((key) => [key, asked.get(key)]));
+
+page("workbench", async (main) => {
+  const recording = asked.get("recording");
+  if (!recording) return choose(main, carried);
+  // Shown as soon as there is something to see; the fit comes into its own places.
+  const [signal, row] = await Promise.all([api.signal(recording, { axis: asked.get("axis") }), api.recording(recording)]);
+  return open(main, recording, row, signal);
+});
+
+async function open(main, recording, row, signal) {
+  const { axis, unit } = signal;
+  const book = notebook();
+  const cards = new Map();
+  const own = new Map();
+  const titles = (effect) => cards.get(effect)?.title ?? effect;
+  const error = h("p", { class: "error", role: "alert" });
+  const [seen, side, listed, cardPlace, nextPlace, keepPlace, bookPlace] = ["pictures stack", "side stack", "list stack", "panel stack about", "panel stack", "panel stack", "panel stack"]
+    .map((name) => h("section", { class: name }));
+  const isGuessing = h("input", { type: "checkbox", id: "guess-first", checked: localStorage.getItem(GUESS_FIRST) === "yes", onchange: () => { localStorage.setItem(GUESS_FIRST, isGuessing.checked ? "yes" : "no"); guess = null; refresh(); } });
+  const suspectsPlace = h("div", {}, h("p", { class: "muted" }, t("workbench.looking")));
+  const verdict = h("p", { class: "verdict" });
+  listed.classList.add("panel");
+  listed.append(
+    h("div", { class: "row spread" }, h("h2", {}, t("workbench.suspects")), h("label", { class: "row check", for: "guess-first" }, isGuessing, t("workbench.guess.first"))),
+    verdict, suspectsPlace);
+
+  main.append(
+    h("header", { class: "row spread opened" },
+      h("p", {}, h("strong", {}, row.name || row.board || recording), ` · ${t("workbench.axis", { axis })} · ${signal.samples.toLocaleString("en").replaceAll(",", " ")} ${t("workbench.samples")} · ${duration(signal.duration_s)}`),
+      h("div", { class: "row" }, signal.axes.length > 1 ? h("nav", { class: "row axes", "aria-label": t("workbench.axes") }, signal.axes.map((one) => h("a", { class: "button", href: links.workbench(recording, one, carried), "aria-current": one === axis ? "page" : null }, one))) : null,
+        carried.lab ? h("a", { class: "button", href: links.lab(carried.lab) }, t("workbench.back_to_lab")) : h("a", { class: "button", href: "/workbench.html" }, t("workbench.another"))), error),
+    seen, h("aside", { class: "beside", "aria-label": t("workbench.error") }, side), h("div", { class: "evidence-row" }, listed, h("div", { class: "stack" }, cardPlace, formulaForm(addOwn))), h("div", { class: "columns of-model" }, nextPlace, h("div", { class: "stack" }, keepPlace, bookPlace)));
+
+  const history = [];
+  let at = -1;
+  let beside = null;
+  let answer = null;
+  let guess = null;
+  let form = null;
+  let busy = false;
+  const draw = pictures(seen, { unit, detail: ([begin_s, end_s]) => fit(history[at].effects, { begin_s, end_s }), pointed: (along) => form?.point(along) });
+  const bench = ledger(side, { undo: () => change(history[at].effects.slice(0, -1)), compare });
+  draw.signal(signal);
+
+  const fit = (effects, part = {}) => api.fit(recording, { axis, effects, formulas: effects.filter((name) => own.has(name)).map((name) => own.get(name)), ...part });
+
+  /** Another model: from what was tried before, or fitted now. */
+  async function change(effects) {
+    if (busy) return;
+    busy = true;
+    say(error, null);
+    const before = history[at];
+    const began = performance.now();
+    try {
+      const known = history.findIndex((model) => model.effects.join() === effects.join());
+      if (known < 0) history.push(await fit(effects));
+      at = known < 0 ? history.length - 1 : known;
+      beside = null;
+      drawModel(performance.now() - began);
+      if (before) {
+        const more = effects.length > before.effects.length;
+        const changed = more ? effects.filter((name) => !before.effects.includes(name)) : before.effects.filter((name) => !effects.includes(name));
+        const { held_out: after, floor, unit: of } = history[at].error;
+        book.write({ step: more ? "added" : "removed", effects: changed, before: before.error.held_out, after, floor, unit: of });
+      }
+      answer = await api.suspects(recording, { axis, effects });
+      refresh();
+    } catch (problem) {
+      if (before && problem.code?.startsWith("formula.")) throw problem;
+      say(error, problem);
+    } finally { busy = false; }
+  }
+
+  function drawModel(ms) {
+    draw.fit(history[at], beside == null ? null : history[beside]);
+    bench.show(history, at, titles, ms);
+    bench.others(history, at, titles, beside);
+  }
+
+  function compare(index) {
+    beside = index;
+    drawModel();
+  }
+
+  function refresh() {
+    if (!answer) return;
+    const hidden = isGuessing.checked && guess === null;
+    draw.pointing(hidden);
+    cardPlace.hidden = false;
+    if (hidden) {
+      verdict.textContent = t("workbench.guess.hidden");
+      form = guessForm(suspectsPlace, cards, {
+        pointed: (covariate) => draw.pointing(true, covariate),
+        guessed(given) {
+          guess = given.effect ?? "none";
+          book.write({ step: "guessed", effects: given.effect ? [given.effect] : [], ...(given.covariate && { covariate: given.covariate }), ...(given.why && { why: given.why }) });
+          book.write({ step: "verdict", code: answer.code, values: answer.values });
+          refresh();
+          verdict.focus?.();
+        },
+      });
+      return;
+    }
+    form = null;
+    verdict.textContent = answer.sentence;
+    showSuspects(suspectsPlace, answer, { open: show, guess, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
+    if (!cardPlace.firstChild) show(answer.suspects[0].effect, false);
+  }
+
+  async function show(effect, isAsked = true) {
+    if (!cards.has(effect)) return;
+    const title = await showCard(cardPlace, effect, cards, { open: show });
+    if (!isAsked) return;
+    const found = answer?.suspects.find((s) => s.effect === effect);
+    book.write({ step: "seen", effect, two_delta_lnL: found?.two_delta_lnL ?? null });
+    title.focus({ preventScroll: false });
+  }
+
+  async function addOwn(given) {
+    own.set(given.name, given);
+    const effects = [...history[at].effects.filter((name) => name !== given.name), given.name];
+    for (let k = history.length - 1; k >= 0; k--) if (k !== at && history[k].effects.includes(given.name)) history.splice(k, 1);
+    await change(effects);
+  }
+
+  /** The model as it is now; formulas of the student's own are stored first, so that it can name them. */
+  async function current() {
+    const { effects } = history[at];
+    for (const name of effects) if (own.has(name)) await api.keepEffect(own.get(name)).catch((problem) => { if (problem.status !== 409) throw problem; });
+    return { recording, axis, effects };
+  }
+
+  let rigName = "";
+  document.addEventListener("rig-changed", ({ detail }) => { rigName = detail.simulated ? t("rig.simulated") : detail.url; });
+  experimentPanel(nextPlace, {
+    ask: () => ({ recording, axis, effects: history[at]?.effects ?? [] }),
+    rig: () => (carried.lab ? t("workbench.next.hidden_bench") : rigName),
+    async run(experiment) {
+      if (!carried.lab) return onRig(experiment);
+      const { lab } = await import("../lab_student.js");
+      return (await lab(carried.lab)).run(experiment.next_experiment.motion, { joins: recording });
+    },
+    done(joined, told) {
+      if (!told) { location.href = links.workbench(joined, axis, carried); return; }
+      const { motion, duration_s } = told.experiment.next_experiment;
+      book.write({ step: "experiment", motion, duration_s, recording: joined });
+      if (told.diagnosis) book.write({ step: "verdict", code: told.diagnosis.code, values: told.diagnosis.values });
+    },
+  });
+  keepPanel(keepPlace, { ask: current });
+  book.panel(bookPlace);
+
+  // The page is there; numbers come into their places.
+  (async () => {
+    try {
+      for (const card of (await api.effects()).items) cards.set(card.name, card);
+      book.write({ step: "opened", recording, name: row.name || row.board || recording, axis, samples: signal.samples, duration_s: signal.duration_s });
+      await change([]);
+      if (answer && !isGuessing.checked) book.write({ step: "verdict", code: answer.code, values: answer.values });
+    } catch (problem) { say(error, problem); }
+  })();
+}

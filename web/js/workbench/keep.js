@@ -1,0 +1,44 @@
+// Keeping a model: a name, files that compensate, and a certificate that says which terms it has.
+
+import { api, links } from "../api.js";
+import { h, say } from "../dom.js";
+import { t } from "../text.js";
+
+/** ask() gives {recording, axis, effects} as they are now, after storing formulas of the student's own. */
+export function keepPanel(place, { ask }) {
+  const name = h("input", { id: "model-name", required: true, maxlength: "100", autocomplete: "off" });
+  const error = h("p", { class: "error", role: "alert" });
+  const told = h("div", { class: "stack", "aria-live": "polite" });
+
+  async function save(event) {
+    event.preventDefault();
+    say(error, null);
+    told.replaceChildren();
+    try {
+      const model = await api.saveModel({ name: name.value.trim(), ...(await ask()) });
+      told.replaceChildren(h("p", {}, t("workbench.keep.kept", { name: model.name })),
+        h("div", { class: "row" },
+          ["json", "h", "py"].map((kind) => h("a", { class: "button", href: links.model(model.id, kind), download: "" }, t(`workbench.keep.${kind}`))),
+          certify(model)));
+    } catch (problem) { say(error, problem); }
+  }
+
+  function certify(model) {
+    const button = h("button", {
+      type: "button",
+      onclick: async () => {
+        say(error, null);
+        button.disabled = true;
+        try {
+          const { number } = await api.certify({ recording: model.recording, model: model.id });
+          button.replaceWith(h("a", { class: "button", href: links.document(number, "pdf"), download: "" }, t("certificates.certified", { number })));
+        } catch (problem) { say(error, problem); button.disabled = false; }
+      },
+    }, t("workbench.keep.certify"));
+    return button;
+  }
+
+  place.replaceChildren(h("h2", {}, t("workbench.keep.title")),
+    h("form", { class: "stack", onsubmit: save }, h("div", {}, h("label", { for: "model-name" }, t("workbench.keep.name")), name),
+      h("div", { class: "row" }, h("button", { type: "submit" }, t("workbench.keep.save")))), error, told);
+}

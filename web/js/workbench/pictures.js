@@ -1,0 +1,144 @@
+// What is looked at: the signal with its model, the residual in time, along whatever it may depend on, and its spectrum.
+
+import { chart } from "../chart.js";
+import { h } from "../dom.js";
+import { fixed, t } from "../text.js";
+
+const GROUP = "workbench";
+const UNIT = { rate: "deg/s", position: "deg", acceleration: "deg/s²", temperature: "°C", time: "s", supply: "V", other_rate: "deg/s" };
+const STEADY = 3;
+const DETAIL_MS = 120;
+
+export const alongName = ({ kind, axis, covariate }) => t(`diagnosis.along.${kind}`, { axis, covariate });
+
+/** The pictures of one recording. detail([from, to]) gives a fit of a stretch in full; pointed(along) hears a guess. */
+export function pictures(place, { unit, detail, pointed }) {
+  const sentence = h("h1", { class: "says" });
+  const traces = h("div", { class: "stack traces" });
+  const grid = h("div", { class: "multiples" });
+  place.replaceChildren(sentence, traces,
+    h("p", { class: "small muted no-print" }, t("chart.hint")),
+    h("h2", { id: "against" }, t("workbench.against")), grid);
+  const time = { label: t("chart.time"), unit: "s", digits: 2 };
+  let shown = null;
+  let base = 0;
+  let waiting = 0;
+
+  const overlay = chart(traces, {
+    name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t("chart.output"), unit, digits: 4 },
+    waiting: t("workbench.loading"), onZoom,
+    series: [
+      { name: t("chart.measured"), role: "measured", draw: "line" },
+      { name: t("workbench.modelled"), role: "model", draw: "dash", joined: true },
+    ],
+  });
+  const residual = chart(traces, {
+    name: t("workbench.residual"), group: GROUP, height: 150, x: time, y: { label: t("chart.residual"), unit: "deg/s", zero: true, digits: 3 },
+    waiting: t("workbench.fitting"),
+    series: [
+      { name: t("chart.residual"), role: "residual", draw: "line" },
+      { name: t("workbench.other"), role: "model", draw: "dots" },
+    ],
+  });
+  const multiples = new Map();
+
+  function onZoom(range) {
+    clearTimeout(waiting);
+    if (!shown || shown.whole) return;
+    waiting = setTimeout(async () => {
+      const of = shown;
+      const part = range ? await detail(range) : of;
+      if (shown === of) drawSignal(part);
+    }, DETAIL_MS);
+  }
+  const drawSignal = ({ columns: c }) => overlay.set([c.time_s, c.measured, c.modelled]);
+
+  function multiple(along) {
+    const name = along.kind === "time" ? t("workbench.along_time") : alongName(along);
+    const figure = h("div", { class: "multiple", "data-along": along.covariate });
+    const plot = chart(figure, {
+      name, height: 150, tight: true, waiting: t("workbench.fitting"),
+      x: { label: name, unit: UNIT[along.kind] ?? "", digits: 2, pad: true, bare: true }, y: { label: t("chart.residual"), unit: "deg/s", zero: true, digits: 3, bare: true },
+      series: [
+        { reads: t("chart.residual"), role: "residual", draw: "dust" },
+        { reads: t("chart.mean"), role: "residual", draw: "line", joined: true, digits: 3 },
+      ],
+    });
+    const says = h("p", { class: "small fails" });
+    const here = h("button", { type: "button", class: "point", "aria-pressed": "false", onclick: () => pointed(along) }, t("workbench.guess.here"));
+    figure.append(says, here);
+    grid.append(figure);
+    return { plot, says, here, figure };
+  }
+
+  const spectrumPlace = h("div", { class: "multiple" });
+  const spectrum = chart(spectrumPlace, {
+    name: t("workbench.spectrum"), height: 150, tight: true, waiting: t("workbench.fitting"),
+    x: { label: t("workbench.frequency"), unit: "Hz", digits: 2, log: true, bare: true }, y: { label: t("workbench.density"), unit: "deg/s/√Hz", digits: 4, log: true, bare: true },
+    series: [{ reads: t("chart.residual"), role: "residual", draw: "line" }, { reads: t("workbench.white"), role: "model", draw: "dots" }],
+  });
+
+  /** The largest that a picture shows: that of the first model while it can, so that an error is seen to fall. */
+  function reach(columns, along) {
+    const sizes = Float64Array.from(columns.residual, Math.abs).sort();
+    let largest = sizes[Math.floor(0.99 * (sizes.length - 1))];
+    for (const { covariate } of along) for (const value of columns[`${covariate}/mean`]) largest = Math.max(largest, 1.15 * Math.abs(value));
+    for (const sigma of columns.spread) largest = Math.max(largest, 2.2 * sigma);
+    if (!base || largest > base) base = largest;
+    return largest > base / STEADY ? base : largest;
+  }
+
+  return {
+    signal({ columns }) {
+      overlay.set([columns.time_s, columns.measured, new Array(columns.time_s.length).fill(null)]);
+    },
+    /** A fit, and beside its residual that of another model where two are compared. */
+    fit(fit, other = null) {
+      shown = fit;
+      const { columns: c, along, failures } = fit;
+      const y = reach(c, along);
+      drawSignal(fit);
+      residual.set([c.window_s, c.residual, other ? other.columns.residual : new Array(c.window_s.length).fill(null)], {
+        band: { x: c.window_s, half: c.spread.map((s) => 2 * s) }, limits: [-y, y],
+        shade: failures.filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
+      });
+      const worst = failures[0];
+      sentence.textContent = worst ? worst.sentence : t("workbench.fits");
+      for (const one of along) {
+        if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
+        const { plot, says, figure } = multiples.get(one.covariate);
+        const at = (part) => c[`${one.covariate}/${part}`];
+        const failing = failures.find((f) => f.covariate === one.covariate);
+        plot.set(merged(at("at"), at("residual"), at("middle"), at("mean")), {
+          band: { x: at("middle"), half: at("sigma").map((s) => 2 * s) }, limits: [-y, y],
+          shade: failing ? [[failing.from, failing.to]] : [],
+        });
+        says.textContent = failing ? failing.sentence : t("workbench.no_failure");
+        figure.classList.toggle("failing", Boolean(failing));
+      }
+      if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
+      spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(fit.noise.density)]);
+      residual.rename(other ? t("workbench.residual_two") : t("workbench.residual", { sigma: fixed(2 * median(c.spread), 3) }), t("chart.residual"));
+    },
+    /** In guessing, each picture can be pointed at. */
+    pointing(on, covariate = null) {
+      grid.classList.toggle("pointing", on);
+      for (const [name, { here }] of multiples) here.setAttribute("aria-pressed", String(name === covariate));
+    },
+  };
+}
+
+const median = (values) => Float64Array.from(values).sort()[values.length >> 1];
+
+/** Points and a curve with places of its own in one table, as a chart wants them. */
+function merged(x1, y1, x2, y2) {
+  const n = x1.length + x2.length;
+  const [x, a, b] = [new Float64Array(n), new Array(n), new Array(n)];
+  for (let i = 0, j = 0, k = 0; k < n; k++) {
+    const first = j >= x2.length || (i < x1.length && x1[i] <= x2[j]);
+    x[k] = first ? x1[i] : x2[j];
+    a[k] = first ? y1[i++] : null;
+    b[k] = first ? null : y2[j++];
+  }
+  return [x, a, b];
+}
