@@ -1,31 +1,33 @@
-"""A recording made ready to be looked at: what is missing, and any model fitted in a moment, with its pictures.
+"""A recording laid out to be looked at: models fitted in a moment, and the short columns that their pictures need.
 
-The diagnosis is made once; its noise stays for every model, so that floors and bands do not move between them. What a
-picture needs comes as short columns: the signal at as many instants as a screen shows, residuals in windows of one
-second (METHOD 2's weak form: good for pictures), their noise, and what they may depend on.
+A picture shows the signal at as many instants as a screen has, residuals in windows of one second (METHOD 2's weak
+form: good for pictures, not for decisions), what noise does to them, and what they may depend on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core import gap, gap_saturation, gap_spectrum
 from calib_core.effects import Acts, Effect, library
-from calib_core.gap import BY_ITSELF, Diagnosis, diagnose
-from calib_core.gap_error import Error, Explanation, Failure, covariate_columns
-from calib_core.gap_search import Search, equivalent_z
-from calib_core.gap_space import Space, Term
+from calib_core.gap_search import equivalent_z
+from calib_core.gap_space import Space
 from calib_core.problem import Problem
 from calib_core.recording import Recording
+from calib_core.workspace import Fitted, Workspace
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+BY_THEMSELVES = ("saturation", "mains_hum")
+"""Effects without a column that a model can have all the same: samples on a limit say nothing; a line is subtracted."""
 MOST_MODELS = 64
 """So many fitted models are kept: an undo or a comparison costs nothing."""
 SPECTRUM_SAMPLES = 1024
@@ -33,67 +35,53 @@ BINS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """Base and effects on one recording."""
+class Model:
+    """Base and effects on one recording, in the order in which they came."""
 
     effects: tuple[str, ...]
-    explanation: Explanation
-    space: Space
-
-    @cached_property
-    def _solution(self) -> tuple[F64, F64]:
-        return self.explanation.solution()
-
-    @cached_property
-    def error(self) -> Error:
-        return self.explanation.error()
-
-    @cached_property
-    def residual_dps(self) -> F64:
-        """(w,) measured less modelled, mean rates in windows of one second."""
-        return np.asarray(self.explanation.residual(self._solution[0]))
-
-    @cached_property
-    def spread_dps(self) -> F64:
-        """(w,) one standard deviation of what noise gives each window."""
-        return np.asarray(self.explanation.spread())
+    fitted: Fitted
+    clip: gap_saturation.Clip | None = None
+    hum: gap_spectrum.Hum | None = None
 
     @property
-    def middle_s(self) -> F64:
-        return np.asarray(self.explanation.middle_s)
+    def space(self) -> Space:
+        return self.fitted.explanation.space
+
+    @property
+    def parameters(self) -> list[dict[str, Any]]:
+        """CONTRACT 3's list."""
+        unit = self.space.design.averages.samples.unit
+        found: list[tuple[str, float, str, float | None]] = []
+        if self.clip is not None:
+            limits = {"V_lo": self.clip.low, "V_hi": self.clip.high}
+            found += [(f"saturation.{name}", value, unit, None) for name, value in limits.items() if value is not None]
+        if self.hum is not None:
+            found.append(("mains_hum.amplitude", self.hum.amplitude, unit, self.hum.amplitude_uncertainty))
+            found.append(("mains_hum.f", self.hum.frequency_hz, "Hz", self.hum.frequency_uncertainty_hz))
+        names = ("name", "value", "unit", "standard_uncertainty")
+        return [*self.fitted.parameters, *(dict(zip(names, row, strict=True)) for row in found)]
 
     @cached_property
-    def along(self) -> Mapping[str, F64]:
-        """(w,) each covariate that moved, as the windows see it."""
-        e = self.explanation
-        at = {
-            name: e.windows.mean(values[:, None])[e.first, 0]
-            for name, values in covariate_columns(self.space).items()
-            if name != "time_s"
-        }
-        return {name: values for name, values in at.items() if np.ptp(values) > 0.0}
-
-    def failures(self) -> list[Failure]:
-        return self.explanation.failures()
-
-    @cached_property
-    def modelled(self) -> F64:
-        """(k,) what the model says the output was, at the samples."""
-        space, values = self.space, self._solution[0]
-        output = space.values[0] + values[0] + np.zeros(len(space.covariates.time_s))
+    def output(self) -> F64:
+        """(k,) what the model says that the output was, at the samples."""
+        space, values = self.space, self.fitted.explanation.solution[0]
+        c = space.covariates
+        output = np.full(len(c.time_s), space.values[0] + values[0])
         if len(space.values) > 1:
-            output += (space.values[1] + values[1]) * space.covariates.rate_dps
-        scale = space.scale_factor or 1.0
-        at = space.base.shape[1]
-        for term in self.explanation.terms:
+            output += (space.values[1] + values[1]) * c.rate_dps
+        scale, at = space.scale_factor or 1.0, space.base.shape[1]
+        for term in self.fitted.explanation.terms:
             acts, shapes = space.shapes(term)
             shape = shapes @ values[at : at + shapes.shape[1]]
+            at += shapes.shape[1]
             if acts is Acts.ANGLE:
-                output -= scale * np.gradient(shape, space.covariates.interval_s)
+                output -= scale * np.gradient(shape, c.interval_s)
             else:
                 output += shape * (scale if acts is Acts.RATE else 1.0)
-            at += shapes.shape[1]
-        return np.asarray(output)
+        if self.hum is not None and np.isfinite(self.hum.A):
+            phase = 2.0 * np.pi * self.hum.alias_hz * c.time_s
+            output += self.hum.A * np.sin(phase) + self.hum.B * np.cos(phase)
+        return output
 
 
 @dataclass(eq=False)
@@ -102,96 +90,90 @@ class Workbench:
 
     recording: Recording
     axis: str
-    suspects: Mapping[str, type[Effect]] = field(default_factory=library)
-    _models: dict[tuple[str, ...], Fitted] = field(default_factory=dict)
+    _models: dict[tuple[str, ...], Model] = field(default_factory=dict)
     _own: dict[str, type[Effect]] = field(default_factory=dict)
 
     @cached_property
-    def diagnosis(self) -> Diagnosis:
+    def diagnosis(self) -> gap.Diagnosis:
         """Of the base alone."""
-        return diagnose(self.recording, self.axis, suspects=dict(self.suspects))
+        return gap.diagnose(self.recording, self.axis)
 
     @cached_property
-    def space(self) -> Space:
-        return self._search.space
+    def _space(self) -> Space:
+        return gap.prepare(self.recording, self.axis)
 
     @cached_property
-    def _search(self) -> Search:
-        if self.diagnosis.search is None:
-            failed = next(check for check in self.diagnosis.checks if check.blocking and not check.ok)
-            raise Problem(failed.code, **failed.values)
-        return self.diagnosis.search
+    def _clip(self) -> gap_saturation.Clip | None:
+        return gap_saturation.find(self.recording, self.axis, self._space.design, self._space.rough_noise)
 
     @cached_property
-    def _shaped(self) -> dict[str, type[Effect]]:
-        c = self.space.covariates
-        return {n: e for n, e in self.suspects.items() if n not in BY_ITSELF and not e.missing(c)}
+    def _whole(self) -> Workspace:
+        workspace = _workspace(self._space)
+        if self._clip is not None:
+            # Samples on a limit must not pass for noise.
+            workspace.space.use_noise(self._kept.space.noise)
+        return workspace
+
+    @cached_property
+    def _kept(self) -> Workspace:
+        """Without the samples on a limit."""
+        assert self._clip is not None
+        return _workspace(gap.prepare(self.recording, self.axis, ~self._clip.clipped))
+
+    @cached_property
+    def _hum(self) -> gap_spectrum.Hum | None:
+        design = self._whole.space.design
+        found = gap_spectrum.find_hum(design.averages.samples, moving=design.moves)
+        return found if found is not None and found.found else None
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Those that can be put into a model of this recording."""
-        return tuple(self._shaped)
+        """Those that a model of this recording can have."""
+        return (*self._whole.effects, *BY_THEMSELVES)
 
     def own(self, effect: type[Effect]) -> None:
-        """A user's own effect; one of the same name is forgotten, and every model with it."""
+        """A user's own effect; models with another of the same name are forgotten."""
         before = self._own.get(effect.name)
-        if before is not None and before.card() != effect.card():
-            self._models = {names: f for names, f in self._models.items() if effect.name not in names}
+        if before is not None and before.card() == effect.card():
+            return
+        if effect.missing(self._whole.space.covariates):
+            raise Problem("diagnosis.effect_not_possible", effect=effect.name)
         self._own[effect.name] = effect
+        self._models = {names: model for names, model in self._models.items() if effect.name not in names}
+        for workspace in (self._whole, *([self._kept] if self._clip is not None else [])):
+            workspace.admit(effect)
 
-    def fit(self, effects: Sequence[str] = ()) -> Fitted:
-        """Base and ``effects``, nonlinear parameters refined. Raises Problem for one that cannot be here."""
+    def fit(self, effects: Sequence[str] = ()) -> Model:
+        """Raises Problem ``diagnosis.effect_not_possible`` for an effect that cannot be here."""
         names = tuple(dict.fromkeys(effects))
         if names not in self._models:
-            fitted = Fitted(names, Explanation(self.space, self._terms(names)), self.space)
             if len(self._models) >= MOST_MODELS:
                 del self._models[next(iter(self._models))]
-            self._models[names] = fitted
+            clip = self._clip if "saturation" in names else None
+            workspace = self._whole if clip is None else self._kept
+            fitted = workspace.fit([name for name in names if name not in BY_THEMSELVES])
+            self._models[names] = Model(names, fitted, clip, self._hum if "mains_hum" in names else None)
         return self._models[names]
-
-    def _terms(self, names: tuple[str, ...]) -> list[Term]:
-        if not names:
-            return []
-        effect = self._effect(names[-1])
-        before = self.fit(names[:-1]).explanation.terms
-        known = self._search._columns
-        columns = {effect.name: known[effect.name]} if effect.name in known else {}
-        search = Search(self.space, {effect.name: effect}, self._search.rng, chosen=[*before], _columns=columns)
-        _, ranking = search.scan()
-        grid = [t for t in search.terms() if t.name == effect.name]
-        if not grid:
-            raise Problem("diagnosis.effect_not_possible", effect=effect.name)
-        term = ranking[0].term if ranking else grid[0]
-        if ranking and (effect.nonlinear() or effect.curvature is not None):
-            term, _ = search.refined(term, before)
-        search.chosen = [*before, term]
-        return search.chosen
-
-    def _effect(self, name: str) -> type[Effect]:
-        effect = self._own.get(name) or self._shaped.get(name)
-        if effect is None or effect.missing(self.space.covariates):
-            raise Problem("diagnosis.effect_not_possible", effect=name)
-        return effect
 
     def ranked(self, effects: Sequence[str] = ()) -> dict[str, tuple[float, float]]:
         """2ΔlnL and equivalent |z| of every other effect beside base and ``effects``."""
-        chosen = [*self.fit(effects).explanation.terms]
-        search = Search(self.space, self._shaped, self._search.rng, chosen=chosen, _columns=self._search._columns)
-        _, ranking = search.scan()
-        return {s.term.name: (s.gain, float(equivalent_z(s.gain, len(s.term.names)))) for s in ranking}
+        model = self.fit(effects)
+        workspace = self._whole if model.clip is None else self._kept
+        freedom = {name: max(1, len(effect.linear())) for name, effect in {**library(), **self._own}.items()}
+        gains = workspace.gains(model.fitted)
+        return {name: (gain, float(equivalent_z(gain, freedom[name]))) for name, gain in gains.items()}
 
-    @property
-    def threshold(self) -> float:
-        """The |z| that noise alone reaches once in a hundred recordings, over every effect tried."""
-        return self._search.threshold
+
+def _workspace(space: Space) -> Workspace:
+    shaped = {n: e for n, e in library().items() if n not in gap.BY_ITSELF and not e.missing(space.covariates)}
+    return Workspace(space, shaped)
 
 
 def decimated(values: F64, most: int) -> Ints:
     """Indices of at most ``most`` values (k,): the lowest and the highest of each stretch, in order of time."""
     if len(values) <= most:
         return np.arange(len(values))
-    stretches = max(1, most // 2)
-    edges = np.linspace(0, len(values), stretches + 1).astype(int)
+    edges = np.linspace(0, len(values), max(1, most // 2) + 1).astype(int)
     picked = [b + np.array([values[b:e].argmin(), values[b:e].argmax()]) for b, e in pairwise(edges.tolist())]
     return np.unique(np.concatenate(picked))
 

@@ -113,6 +113,12 @@ class Workspace:
             "correlation_time_s": noise.correlation_time_s if noise.ar1 > 0.0 else None,
         }
 
+    def admit(self, effect: type[Effect]) -> None:
+        """Takes one more suspect, a user's own; another of the same name makes room for it."""
+        self._search.suspects[effect.name] = effect
+        self._search.columns.pop(effect.name, None)
+        self._search.terms()
+
     def fit(self, effects: Sequence[str] = (), fixed: Mapping[str, float] | None = None) -> Fitted:
         """Base and ``effects``, fitted together; those of their parameters that are in ``fixed``, by full name
         (``bias_V``, ``warm_up.tau``), keep the value given there.

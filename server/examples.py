@@ -3,8 +3,7 @@
 Their boards can be put on any simulated rig: what a student measures there comes from the same gyro.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from calib_core.excitation import Excitation
@@ -31,7 +30,6 @@ class Example:
     motion: tuple[Excitation, ...]
     axis: str = "x"
     covariates: bool = False
-    header: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def board(self) -> str:
@@ -71,7 +69,7 @@ def record(example: Example) -> "Recording":
     from server import engine
     from server.devices import open_rig
 
-    rig = open_rig(f"twin:?seed={example.seed}&covariates={int(example.covariates)}")
+    rig = open_rig(f"twin:?seed={example.seed}&covariates={int(example.covariates)}&effects={example.effects}")
     rig.open()
     try:
         plan = plan_of(example.motion, experiment=example.name, axis=example.axis, seed=example.seed)

@@ -15,17 +15,15 @@ import numpy as np
 from calib_core.problem import Problem
 from server import diagnosis
 from server.live import encode
-from server.texts import render
+from server.texts import render, texts
 
 if TYPE_CHECKING:
-    from calib_core.workbench import Fitted, Workbench
+    from calib_core.workbench import Model, Workbench
 
 Words = dict[str, Any]
 
 WARM = 3
 """So many recordings stay ready; one of 22 000 samples takes some 40 MB."""
-UNSHAPED = ("adc_quantization", "bias_random_walk", "input_loading", "mains_hum", "saturation")
-"""Effects that have a test of their own and no shape that a fit could add."""
 PATH_HZ = 25.0
 """Fine enough to draw a motion of 4 Hz."""
 _warm: OrderedDict[tuple[Path, str, str], Workbench] = OrderedDict()
@@ -87,75 +85,84 @@ def fit(
     bench = warm(data, recording, axis)
     for own in formulas:
         bench.own(formula.from_json(own))
-    fitted = bench.fit(effects)
-    samples = fitted.space.design.averages.samples
+    model = bench.fit(effects)
+    fitted, samples = model.fitted, model.space.design.averages.samples
     time = samples.time_s - samples.time_s[0]
     begin, end = (time[0] if window[0] is None else window[0], time[-1] if window[1] is None else window[1])
     inside = slice(int(np.searchsorted(time, begin)), max(2, int(np.searchsorted(time, end, side="right"))))
     at = inside.start + decimated(samples.output[inside], points)
-    scale = abs(fitted.space.scale_factor) or 1.0
-    f, density = spectrum((samples.output - fitted.modelled) / scale, samples.interval_s)
+    scale = abs(model.space.scale_factor) or 1.0
+    f, density = spectrum((samples.output - model.output) / scale, samples.interval_s)
     arrays = {
-        "time_s": time[at], "measured": samples.output[at], "modelled": fitted.modelled[at],
+        "time_s": time[at], "measured": samples.output[at], "modelled": model.output[at],
         "window_s": fitted.middle_s, "residual": fitted.residual_dps, "spread": fitted.spread_dps,
         "frequency_hz": f, "density": density,
     }  # fmt: skip
-    for name, values in {"time_s": fitted.middle_s, **fitted.along}.items():
+    along = {name: values for name, values in fitted.along.items() if np.ptp(values) > 0.0}
+    for name, values in along.items():
         middle, mean, sigma = stretches(values, fitted.residual_dps, fitted.spread_dps)
         order = np.argsort(values, kind="stable")
         arrays |= {f"{name}/at": values[order], f"{name}/residual": fitted.residual_dps[order]}
         arrays |= {f"{name}/middle": middle, f"{name}/mean": mean, f"{name}/sigma": sigma}
+    noise = fitted.explanation.space.noise.noise
     head = {
-        "axis": axis, "unit": samples.unit, "effects": list(fitted.effects),
-        "whole": len(at) == inside.stop - inside.start,
-        "from": float(time[0]), "to": float(time[-1]), "samples": len(time), "error": _error(fitted),
-        "steps": [_error(bench.fit(fitted.effects[:k]))["held_out"] for k in range(len(fitted.effects) + 1)],
-        "parameters": _parameters(fitted), "failures": _failures(fitted, lang),
-        "along": [{"name": n, **diagnosis.along(n)["values"], "kind": _kind(n)} for n in ("time_s", *fitted.along)],
-        "noise": _noise(fitted),
+        "axis": axis, "unit": samples.unit, "effects": list(model.effects), "samples": len(time),
+        "whole": len(at) == inside.stop - inside.start, "error": _error(model),
+        "steps": [_error(bench.fit(model.effects[:k]))["held_out"] for k in range(len(model.effects) + 1)],
+        "parameters": model.parameters, "failures": _failures(model, lang),
+        "along": [{"kind": _kind(n), **diagnosis.along(n)["values"]} for n in along],
+        "white_density": noise.white / scale * float(np.sqrt(2.0 * samples.interval_s)),
     }  # fmt: skip
     return encode(diagnosis.plain(head), arrays)
 
 
 def suspects(data: Path, recording: str, axis: str, effects: Sequence[str], lang: str) -> Words:
     """The verdict on the base, and every effect of the library with its evidence beside ``effects``."""
-    from calib_core.gap import p_value
     from calib_core.gap_report import to_json
 
     bench = warm(data, recording, axis)
     answer = diagnosis.told(diagnosis.explained(to_json(bench.diagnosis)), lang)
-    rows = {c["effect"]: _row(c) for c in answer["candidates"]}
-    tested = sum(row["status"] == "tested" for row in rows.values()) or 1
-    if effects:
-        ranked = bench.ranked(effects)
-        for name, row in rows.items():
-            if name in ranked:
-                gain, z = ranked[name]
-                row |= {"two_delta_lnL": gain, "z": z, "p": p_value(z), "status": "tested"}
-            elif name in bench.effects and name not in effects:
-                row |= {"two_delta_lnL": None, "z": None, "p": None, "status": "not_excited"}
-        over = [row for row in rows.values() if (row["z"] or 0.0) >= bench.threshold and row["effect"] not in effects]
-        best = max((row["two_delta_lnL"] for row in over), default=0.0)
-        ties = [[row["effect"] for row in over if best - row["two_delta_lnL"] < 6.0]] if len(over) > 1 else []
-    else:
-        for found in answer["missing"]:
-            rows[found["effect"]] |= {"two_delta_lnL": found["two_delta_lnL"], "p": found["p"], "status": "tested"}
-            rows[found["effect"]]["z"] = _z(found["p"], found["two_delta_lnL"])
-        ties = answer["rivals"]
-        for names in ties:
-            first = rows[names[0]]
-            for name in names[1:]:
-                rows[name] |= {key: first[key] for key in ("two_delta_lnL", "z", "p")} | {"status": "tested"}
+    threshold = bench.diagnosis.search.threshold if bench.diagnosis.search else float("inf")
+    rows = {row["effect"]: {**row, "z": _z(row)} for row in answer["candidates"]}
+    ties = _beside(bench, effects, rows, threshold) if effects else _found(answer, rows)
+    for name in effects:
+        rows.setdefault(name, {"effect": name, "status": "tested", "two_delta_lnL": None, "p": None, "z": None})
+    tested = sum(row["status"] == "tested" for row in rows.values())
     for name, row in rows.items():
-        row["tie"] = next((k for k, names in enumerate(ties) if name in names and len(names) > 1), None)
-        row["in_model"] = name in effects
-        row["can_be_added"] = name in bench.effects
-        row |= _evidence(row, bench.threshold, tested)
+        row["tie"] = next((k for k, names in enumerate(ties) if name in names), None)
+        row["in_model"], row["can_be_added"] = name in effects, name in bench.effects
+        row |= _evidence(row, threshold, tested)
         row["sentence"] = render(row["code"], row["values"], lang)
-        row["title"] = render(f"effects.{name}.name", {}, lang)
+        row["title"] = texts(lang).get(f"effects.{name}.name", name)
     order = sorted(rows.values(), key=lambda r: (r["status"] != "tested", -(r["z"] or 0.0), r["effect"]))
     verdict = {key: answer[key] for key in ("verdict", "sentence", "code", "values", "checks", "limits", "unknown")}
-    return dict(diagnosis.plain({**verdict, "threshold": bench.threshold, "suspects": order}))
+    return dict(diagnosis.plain({**verdict, "threshold": threshold, "suspects": order}))
+
+
+def _found(answer: Words, rows: dict[str, Words]) -> list[list[str]]:
+    """Puts what the diagnosis found, and what would serve in its place, into the rows; gives the ties."""
+    for found in answer["missing"]:
+        evidence = {"two_delta_lnL": found["two_delta_lnL"], "p": found["p"], "status": "tested"}
+        names = next((tie for tie in answer["rivals"] if found["effect"] in tie), [found["effect"]])
+        for name in names:
+            rows[name] |= evidence | {"z": _z(evidence)}
+    return [names for names in answer["rivals"] if len(names) > 1]
+
+
+def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], threshold: float) -> list[list[str]]:
+    """Puts the evidence beside a model into the rows; gives the one tie of the best, if there is any."""
+    from calib_core.gap import p_value
+    from calib_core.gap_search import RIVAL
+
+    ranked = bench.ranked(effects)
+    for name, row in rows.items():
+        if name in ranked:
+            gain, z = ranked[name]
+            row |= {"two_delta_lnL": gain, "z": z, "p": p_value(z), "status": "tested"}
+    over = [row for row in rows.values() if row["effect"] in ranked and row["z"] >= threshold]
+    best = max((row["two_delta_lnL"] for row in over), default=0.0)
+    tied = [row["effect"] for row in over if best - row["two_delta_lnL"] < RIVAL]
+    return [tied] if len(tied) > 1 else []
 
 
 def path(motion: Sequence[Mapping[str, Any]]) -> Words:
@@ -169,65 +176,53 @@ def path(motion: Sequence[Mapping[str, Any]]) -> Words:
     return {"time_s": time.tolist(), "angle_deg": {axis: np.round(angles[axis], 3).tolist() for axis in moved}}
 
 
-def _row(candidate: Mapping[str, Any]) -> Words:
-    z = _z(candidate["p"], candidate["two_delta_lnL"]) if candidate["status"] == "tested" else None
-    return {**candidate, "z": z}
-
-
-def _z(p: float | None, gain: float | None) -> float:
+def _z(evidence: Mapping[str, Any]) -> float | None:
     """The |z| of a chance, by the gain where the chance is too small to be told from nought."""
     from scipy.special import ndtri
 
-    if p is None or p < 1e-250:
-        return float(np.sqrt(max(gain or 0.0, 0.0)))
-    return float(-ndtri(p / 2.0))
+    if evidence["status"] != "tested":
+        return None
+    if evidence["p"] is None or evidence["p"] < 1e-250:
+        return float(np.sqrt(max(evidence["two_delta_lnL"] or 0.0, 0.0)))
+    return float(-ndtri(evidence["p"] / 2.0))
 
 
 def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
-    name = row["effect"]
+    """A word for how sure it is, and the code and values of its sentence."""
+    from calib_core.gap import BY_ITSELF
+
+    apart = row["effect"] in BY_ITSELF
     if row["in_model"]:
-        return {"word": "in_model", "code": "workbench.evidence.in_model", "values": {}}
-    if row["status"] != "tested":
-        return {"word": row["status"], "code": f"workbench.evidence.{row['status']}", "values": {}}
-    if name in UNSHAPED and not row["two_delta_lnL"]:
+        word = "in_model"
+    elif row["status"] != "tested":
+        word = row["status"]
+    elif apart and not row["two_delta_lnL"]:
         return {"word": "nothing", "code": "workbench.evidence.by_itself", "values": {}}
-    if (row["z"] or 0.0) < threshold and name not in UNSHAPED:
-        return {"word": "nothing", "code": "workbench.evidence.nothing", "values": {}}
-    chance = 0.0 if row["p"] is None else min(1.0, row["p"] * tested)
-    found = diagnosis.certainty(diagnosis.effect_words([name]), chance)
-    return {"word": found["code"].rpartition(".")[2], **found}
+    elif apart or row["z"] >= threshold:
+        chance = 0.0 if row["p"] is None else min(1.0, row["p"] * tested)
+        found = diagnosis.certainty(diagnosis.effect_words([row["effect"]]), chance)
+        return {"word": found["code"].rpartition(".")[2], **found}
+    else:
+        word = "nothing"
+    return {"word": word, "code": f"workbench.evidence.{word}", "values": {}}
 
 
 def _kind(name: str) -> str:
     return next((kind for ending, kind in diagnosis.KINDS.items() if name.endswith(ending)), "other")
 
 
-def _noise(fitted: Fitted) -> Words:
-    noise, scale = fitted.space.noise.noise, abs(fitted.space.scale_factor) or 1.0
-    white = noise.white / scale
-    interval = fitted.space.design.averages.samples.interval_s
-    correlated = {"ar1_dps": noise.ar1 / scale, "correlation_time_s": noise.correlation_time_s}
-    return {"white_dps": white, "density": white * float(np.sqrt(2.0 * interval)), **correlated}
-
-
-def _error(fitted: Fitted) -> Words:
-    error = fitted.error
+def _error(model: Model) -> Words:
+    error = model.fitted.error
     floor = {"floor": error.floor_rms_dps, "block_s": error.block_s, "blocks": error.blocks}
     return {"held_out": error.held_out_rms_dps, **floor, "unit": "deg/s"}
 
 
-def _parameters(fitted: Fitted) -> list[Words]:
-    from calib_core.gap_report import parameters
-
-    return parameters(fitted.explanation)
-
-
-def _failures(fitted: Fitted, lang: str) -> list[Words]:
+def _failures(model: Model, lang: str) -> list[Words]:
     """The worst stretch of each covariate that fails, worst first."""
     from calib_core.gap_report import FAILING
 
     found = []
-    for f in fitted.failures():
+    for f in model.fitted.failures():
         if abs(f.z) >= FAILING:
             told: Words = {
                 "covariate": f.covariate,

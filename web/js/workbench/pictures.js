@@ -117,7 +117,7 @@ export function pictures(place, { unit, detail, pointed }) {
         figure.classList.toggle("failing", Boolean(failing));
       }
       if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
-      spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(fit.noise.density)]);
+      spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(fit.white_density)]);
       residual.rename(other ? t("workbench.residual_two") : t("workbench.residual", { sigma: fixed(2 * median(c.spread), 3) }), t("chart.residual"));
     },
     /** In guessing, each picture can be pointed at. */
