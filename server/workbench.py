@@ -159,6 +159,9 @@ def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], th
         if name in ranked:
             gain, z = ranked[name]
             row |= {"two_delta_lnL": gain, "z": z, "p": p_value(z), "status": "tested"}
+        elif name in bench.effects and row["status"] == "tested" and row["p"] is not None:
+            # Its column is a mixture of those in the model.
+            row |= {"two_delta_lnL": None, "z": None, "p": None, "status": "not_excited", "word": "spanned"}
     over = [row for row in rows.values() if row["effect"] in ranked and row["z"] >= threshold]
     best = max((row["two_delta_lnL"] for row in over), default=0.0)
     tied = [row["effect"] for row in over if best - row["two_delta_lnL"] < RIVAL]
@@ -195,7 +198,7 @@ def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
     if row["in_model"]:
         word = "in_model"
     elif row["status"] != "tested":
-        word = row["status"]
+        word = row.get("word", row["status"])
     elif apart and not row["two_delta_lnL"]:
         return {"word": "nothing", "code": "workbench.evidence.by_itself", "values": {}}
     elif apart or row["z"] >= threshold:

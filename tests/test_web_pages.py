@@ -8,7 +8,16 @@ from typing import Any
 import pytest
 from browser import PHONE, Server, Window, chromium, serving
 
-PAGES = ("/", "/workbench.html", "/run.html", "/boards.html", "/certificates.html", "/compare.html", "/rig.html", "/thesis.html")
+PAGES = (
+    "/",
+    "/workbench.html",
+    "/run.html",
+    "/boards.html",
+    "/certificates.html",
+    "/compare.html",
+    "/rig.html",
+    "/thesis.html",
+)
 
 
 @pytest.fixture(scope="module")

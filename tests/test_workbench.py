@@ -118,7 +118,7 @@ def test_rivals_share_a_tie_and_what_cannot_be_tested_says_so(stored: tuple[Path
         for row in workbench.suspects(data, ids["one_sine"], "x", ("bandwidth_lag",), "en")["suspects"]
     }
     assert beside["bandwidth_lag"]["word"] == "in_model"
-    assert (beside["time_offset"]["z"] or 0.0) < answer["threshold"]
+    assert beside["time_offset"]["word"] in ("nothing", "spanned")
 
 
 def test_a_formula_of_ones_own_is_an_effect_like_any_other(stored: tuple[Path, dict[str, str]]) -> None:

@@ -43,7 +43,7 @@ export function showSuspects(place, answer, { open, toggle, guess }) {
     rows.push([group, group.length < 2 ? row(s)
       : h("li", { class: "tied" }, h("p", { class: "small" }, t("workbench.tied")), h("ul", {}, group.map(row)))]);
   }
-  const isFirst = ([group], k) => k < FEW || group.some((s) => s.in_model || !["nothing", "no_data", "not_excited"].includes(s.word) || s.effect === guess);
+  const isFirst = ([group], k) => k < FEW || group.some((s) => s.in_model || !["nothing", "no_data", "not_excited", "spanned"].includes(s.word) || s.effect === guess);
   const first = rows.filter(isFirst);
   const rest = rows.filter((one, k) => !isFirst(one, k));
   place.replaceChildren(
