@@ -3,8 +3,12 @@
 import { h, say } from "./dom.js";
 import { t } from "./text.js";
 
-/** answerForm({effects, answer, runs, onSubmit}) -> node; `effects` as /effects gives them, `answer` what was handed in before. */
-export function answerForm({ effects, answer, runs, onSubmit }) {
+/** answerForm({code, effects, answer, runs, onSubmit}) -> node; `effects` as /effects gives them, `answer` what was
+ *  handed in before. What was begun is kept in this tab: thinking goes on in the workbench. */
+export function answerForm({ code, effects, answer: handed, runs, onSubmit }) {
+  const draft = `gyrobench.lab.${code}`;
+  const begun = JSON.parse(sessionStorage.getItem(draft) ?? "null");
+  const answer = begun ?? handed;
   const titles = [...effects].sort((a, b) => a.title.localeCompare(b.title));
   const rows = h("div", { class: "stack" });
   const error = h("p", { class: "error", role: "alert" });
@@ -14,7 +18,7 @@ export function answerForm({ effects, answer, runs, onSubmit }) {
   const confidence = h("input", { id: "confidence", type: "range", min: 0, max: 100, step: 5, value: answer?.confidence ?? 50, oninput: tell });
   const shown = h("output", { for: "confidence" });
   const reasoning = h("textarea", { id: "reasoning", rows: 5, maxlength: 4000 }, answer?.reasoning ?? "");
-  const basis = h("select", { id: "basis" }, [...runs].reverse().map(({ recording, name }) => h("option", { value: recording, selected: recording === answer?.recording }, name)), h("option", { value: "", selected: answer && !answer.recording }, t("lab.basis_none")));
+  const basis = h("select", { id: "basis" }, [...runs].reverse().map(({ recording, name }) => h("option", { value: recording, selected: recording === handed?.recording }, name)), h("option", { value: "", selected: handed && !handed.recording }, t("lab.basis_none")));
 
   function tell() { shown.textContent = `${confidence.value} %`; }
   function show() {
@@ -40,20 +44,23 @@ export function answerForm({ effects, answer, runs, onSubmit }) {
     rows.append(row);
   }
 
+  const findings = () => (form.claim.value === "found"
+    ? [...rows.children].map((row) => [...new Set([...row.querySelectorAll("select")].map(({ value }) => value).filter(Boolean))]).filter((names) => names.length)
+    : []);
   const form = h("form", {
     class: "stack", novalidate: true,
+    oninput: () => sessionStorage.setItem(draft, JSON.stringify({ claim: form.claim.value, findings: findings(), confidence: Number(confidence.value), reasoning: reasoning.value })),
     onsubmit: async (event) => {
       event.preventDefault();
       say(error, null);
       const claim = form.claim.value;
-      const findings = claim === "found"
-        ? [...rows.children].map((row) => [...new Set([...row.querySelectorAll("select")].map(({ value }) => value).filter(Boolean))]).filter((names) => names.length)
-        : [];
-      if (!claim || (claim === "found" && !findings.length)) { say(error, { message: t("lab.no_claim") }); return; }
+      const names = findings();
+      if (!claim || (claim === "found" && !names.length)) { say(error, { message: t("lab.no_claim") }); return; }
       send.disabled = true;
       send.textContent = t("lab.submitting");
+      sessionStorage.removeItem(draft);
       try {
-        await onSubmit({ findings, confidence: Number(confidence.value), reasoning: reasoning.value.trim(), recording: basis.value || null });
+        await onSubmit({ findings: names, confidence: Number(confidence.value), reasoning: reasoning.value.trim(), recording: basis.value || null });
       } catch (problem) {
         say(error, problem);
       }
@@ -62,7 +69,7 @@ export function answerForm({ effects, answer, runs, onSubmit }) {
     },
   },
   h("fieldset", { class: "stack" }, h("legend", { class: "label" }, t("lab.claim")),
-    radio("found", Boolean(answer?.findings.length)), found, radio("none", Boolean(answer && !answer.findings.length))),
+    radio("found", begun ? begun.claim === "found" : Boolean(answer?.findings.length)), found, radio("none", begun ? begun.claim === "none" : Boolean(answer && !answer.findings.length))),
   h("div", {}, h("label", { for: "reasoning" }, t("lab.reasoning")), reasoning),
   h("div", {}, h("div", { class: "row spread" }, h("label", { for: "confidence" }, t("lab.confidence")), shown), confidence),
   h("div", {}, h("label", { for: "basis" }, t("lab.basis")), basis),

@@ -94,7 +94,9 @@ export async function classroom(main, exercise, key) {
       : h("p", { class: "muted" }, t("lab.no_student")));
   }
   await look();
-  setInterval(() => { if (!document.hidden) attempt(look); }, EVERY_MS);
+  const again = () => { if (!document.hidden) attempt(look); };
+  document.addEventListener("visibilitychange", again);
+  setInterval(again, EVERY_MS);
 }
 
 function row({ name, answer, grade, runs, measured_s, diagnosis, submitted_at, notebook }, words) {

@@ -51,7 +51,7 @@ export async function hunt(main, exercise, student) {
     const { runs, answer, session } = student;
     editor.runs(runs, session);
     recordings.replaceChildren(runs.length
-      ? table([t("lab.recording"), t("lab.done"), { n: t("lab.length") }, ""], [...runs].reverse().map((run) => [
+      ? table([t("lab.recording"), t("lab.done"), { n: t("lab.length") }, t("lab.data")], [...runs].reverse().map((run) => [
         run.name, run.sentence, { n: duration(run.duration_s) },
         h("span", { class: "row" }, h("a", { class: "button open", href: links.workbench(run.recording, axis, { lab: code, notebook: student.notebook }) }, t("lab.open")),
           h("a", { href: links.recording(run.recording), download: "" }, "CSV"))]), { label: t("lab.step_look"), cards: true })
@@ -59,7 +59,7 @@ export async function hunt(main, exercise, student) {
     handed.textContent = answer ? t("lab.handed_in", { time: when(student.submitted_at), answer: answerWords(answer, names), confidence: answer.confidence }) : t("lab.answer_about");
     if (!exercise.revealed_at) {
       form.replaceChildren(answerForm({
-        effects, answer, runs,
+        code, effects, answer, runs,
         async onSubmit(given) {
           student = await api.labAnswer(code, student.student, given);
           show();

@@ -96,7 +96,7 @@ export async function setupForm() {
       field("starter", select("starter", [["", t("lab.starter_none")], ["sine", t("lab.starter_sine")], ["mixed", t("lab.starter_mixed")]], ""), "lab.starter")),
     h("div", { class: "pair" },
       field("white", number("white", { min: 0, max: 20, placeholder: "1.2" }), "lab.white"),
-      field("seed", number("seed", { min: 0, step: 1, placeholder: t("lab.seed_any") }), "lab.seed")),
+      field("seed", number("seed", { min: 0, step: 1, placeholder: t("lab.seed_any") }), "lab.seed", t("lab.seed_about"))),
     h("div", { class: "pair" },
       field("correlated", number("correlated", { min: 0, max: 20, placeholder: "0" }), "lab.correlated"),
       field("correlation", number("correlation", { min: 0.02, max: 60, placeholder: "0.5" }), "lab.correlation")))),
