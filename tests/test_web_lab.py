@@ -124,6 +124,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         page.select_option("#hidden-0", "hysteresis")
         page.fill("#hidden-0-strength", "3")
         page.click("text=Make the exercise")
+        page.wait_for_selector(".board-code .code")  # seen: the page shows itself when it is whole
         code = page.inner_text(".board-code .code")
         assert re.fullmatch("[B-Z2-9]{6}", code)
 
@@ -154,6 +155,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         assert bench.locator(".lines li").count() == 2
         assert student.widest() <= PHONE["width"]
 
+        page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # the teacher looks again
         page.wait_for_selector("text=1 have joined, 1 have handed in")
         assert page.locator(".mark").count() == 0, "marks before the reveal, where the class may look"
         page.click("text=Reveal the truth")
