@@ -6,6 +6,7 @@ exponents are bounded, so no text can take long or grow large, and a result that
 """
 
 import ast
+import json
 import operator
 import re
 from collections.abc import Callable, Mapping
@@ -197,6 +198,17 @@ class UserEffect(Effect):
     unit: ClassVar[str]
 
     @classmethod
+    def missing(cls, c: Covariates) -> bool:
+        """Also where the formula has no value, for instance a logarithm below zero."""
+        if super().missing(c):
+            return True
+        try:
+            cls.columns(c)
+        except Problem:
+            return True
+        return False
+
+    @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
         (parameter,) = cls.linear()
         return {parameter: cls.formula({name: getattr(c, name) for name in cls.formula.names})}
@@ -259,3 +271,14 @@ def from_json(saved: Mapping[str, object]) -> type[UserEffect]:
             raise Problem("formula.key_missing", key=key, keys=", ".join(wanted))
     name, formula, parameter, unit, acts = (str(saved[key]) for key in wanted)
     return effect_of(name, formula, parameter, unit, acts)
+
+
+def from_text(text: str) -> list[type[UserEffect]]:
+    """Effects from a JSON list of them; raises Problem ``formula.…``."""
+    try:
+        saved = json.loads(text)
+    except ValueError:
+        saved = None
+    if not isinstance(saved, list) or not all(isinstance(one, dict) for one in saved):
+        raise Problem("formula.not_a_list")
+    return [from_json(one) for one in saved]

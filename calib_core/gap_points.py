@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_core.effects import Covariates, Effect, library
+from calib_core.effects import Acts, Covariates, Effect, library
+from calib_core.formula import UserEffect
 from calib_core.gap import p_value
 from calib_core.gap_checks import Check
 from calib_core.gap_search import FALSE_ALARM, RIVAL, SHARE
@@ -98,6 +99,12 @@ class Readings:
             else:
                 (size, shape), *_ = effect.columns(self.covariates).items()
                 found.append(Column(effect, shape * self.turning_s, size, True))
+        for effect in suspects.values():
+            known = issubclass(effect, UserEffect) and set(effect.formula.names) <= {"rate_dps", "direction"}
+            if known and effect.acts is not Acts.ANGLE and not effect.missing(self.covariates):
+                ((size, shape),) = effect.columns(self.covariates).items()
+                felt = effect.acts is Acts.RATE
+                found.append(Column(effect, shape * (self.turning_s if felt else self.duration_s), size, felt))
         if MOVED in suspects:
             found.append(Column(suspects[MOVED], self.duration_s, "a", False))
         return found

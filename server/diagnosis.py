@@ -82,6 +82,7 @@ def of_points(
     answers = [diagnose(points.take((points.board == b) & (points.axis == a)), effects=effects) for b, a in chosen]
     for answer in answers:
         answer["recording"]["file"] = file
+        answer["user_effects"] = own_effects(pool, [*effects, *(m["effect"] for m in answer["missing"])])
     return [explained(answer) for answer in answers]
 
 
@@ -109,6 +110,7 @@ def of_recording(
     found = diagnose(recording, axis, effects=effects, suspects=pool)
     answer = to_json(found)
     answer["recording"]["file"] = file
+    answer["user_effects"] = own_effects(pool, [*effects, *(m["effect"] for m in answer["missing"])])
     return explained(answer) | {"next_experiment": plain(following(found, axes))}
 
 
@@ -118,6 +120,13 @@ def axis_of(recording: "Recording", axis: str | None) -> str:
         raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(recording.axes))
     named = recording.header.get("axis", "")
     return axis or (named if named in recording.axes else recording.axes[0])
+
+
+def own_effects(pool: "Mapping[str, type[Effect]]", names: Iterable[str]) -> list[dict[str, str]]:
+    """The formulas of those of ``names`` that users made: with them the answer can be used anywhere."""
+    from calib_core.formula import UserEffect, to_json
+
+    return [to_json(effect) for name in names if issubclass(effect := pool[name], UserEffect)]
 
 
 def _known(effects: Sequence[str], pool: Iterable[str]) -> None:
@@ -252,6 +261,9 @@ def cards(lang: str) -> list[Words]:
     return [card(effect, lang) for effect in library().values()]
 
 
+OWN = ("summary", "cause", "signature", "confused_with", "excite_it", "source")
+
+
 def card(effect: "type[Effect]", lang: str) -> Words:
     """Name, place, parameters and physics card of an effect."""
     known = texts(lang)
@@ -262,7 +274,17 @@ def card(effect: "type[Effect]", lang: str) -> Words:
     ]
     title = known.get(f"effects.{effect.name}.name", effect.name)
     place = {"name": effect.name, "title": title, "stage": effect.stage.value, "needs": list(effect.needs)}
-    return {**told, **place, "parameters": parameters}
+    return {**told, **place, "parameters": parameters, "own": False}
+
+
+def own_card(row: Mapping[str, Any], lang: str) -> Words:
+    """The card of a user's own effect, as the store has it; its fields are the formula and what follows from that."""
+    from calib_core.formula import from_json
+
+    effect = from_json(row)
+    said = {key: render(f"effects_own.{key}", {"names": list(effect.formula.names)}, lang) for key in OWN}
+    kept = {key: row[key] for key in ("formula", "acts", "note", "created_at")}
+    return card(effect, lang) | said | ({"summary": row["note"]} if row["note"] else {}) | kept | {"own": True}
 
 
 # --- words -------------------------------------------------------------------------------------------------------

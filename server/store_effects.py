@@ -1,18 +1,18 @@
 """Users' own effects: a formula, its parameter and unit, under a name of its own."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from urllib.parse import parse_qsl, quote
 
 from sqlite_utils import Database
 
+from calib_core.effects import Effect, library
+from calib_core.formula import UserEffect, from_json, to_json
 from calib_core.problem import Problem
 from server.store_db import FILE, Connection, Row, dumps, migrations, now
-
-if TYPE_CHECKING:
-    from calib_core.effects import Effect
-    from calib_core.formula import UserEffect
 
 MOST = 100
 
@@ -28,8 +28,6 @@ class Effects:
 
     def add(self, given: Mapping[str, object], *, note: str = "") -> Row:
         """Keeps an effect (``formula.to_json``'s keys). Raises Problem ``formula.…``, ``effect.exists``."""
-        from calib_core.formula import from_json, to_json
-
         body = to_json(from_json(given))
         row = {"name": body["name"], "body": dumps(body), "note": note, "created_at": now()}
         with self._at.write() as db:
@@ -56,38 +54,56 @@ class Effects:
 
         Models, certificates and recordings that use it carry its formula, and go on working.
         """
-        from calib_core.effects import library
-
         if name in library():
             raise Problem("effect.of_library", effect=name)
         self.get(name)
         with self._at.write() as db:
             db.table("effects").delete(name)
 
-    def classes(self) -> "dict[str, type[UserEffect]]":
+    def classes(self) -> dict[str, type[UserEffect]]:
         """By name. What a later library has under the same name is left to the library."""
-        from calib_core.effects import library
-        from calib_core.formula import from_json
-
         return {row["name"]: from_json(row) for row in self.find() if row["name"] not in library()}
 
-    def suspects(self) -> "dict[str, type[Effect]]":
+    def suspects(self) -> dict[str, type[Effect]]:
         """The library and the users' own: what a diagnosis may name."""
-        from calib_core.effects import library
-
         return {**library(), **self.classes()}
 
+    def address(self, url: str) -> str:
+        """A twin's address with the formulas of the users' own effects that it hides: it needs no store then."""
+        _, _, query = url.partition("?")
+        options = dict(parse_qsl(query))
+        if not url.startswith("twin:") or "own" in options:
+            return url
+        paths = [part.partition(":")[0].strip().split(".") for part in options.get("effects", "").split(";")]
+        named = {path[-2] for path in paths if len(path) > 1}
+        used = [to_json(effect) for name, effect in self.classes().items() if name in named]
+        return f"{url}&own={quote(dumps(used), safe='')}" if used else url
 
-def suspects_of(data: str | Path | None) -> "dict[str, type[Effect]]":
-    """``suspects`` of the store in ``data``; only the library where there is no store yet, and none is made."""
-    from calib_core.effects import library
+
+def suspects_of(data: str | Path | None) -> dict[str, type[Effect]]:
+    """``Effects.suspects`` of the store in ``data``; only the library where there is no store yet, and none is made."""
+    with _there(data) as effects:
+        return effects.suspects() if effects else dict(library())
+
+
+def address_of(url: str, data: str | Path | None) -> str:
+    """``Effects.address`` by the store in ``data``, if there is one."""
+    if "effects=" not in url:
+        return url
+    with _there(data) as effects:
+        return effects.address(url) if effects else url
+
+
+@contextmanager
+def _there(data: str | Path | None) -> Iterator[Effects | None]:
     from server.settings import data_dir
     from server.store import Store
 
     if not (data_dir(data) / FILE).is_file():
-        return dict(library())
+        yield None
+        return
     with Store(data) as store:
-        return store.effects.suspects()
+        yield store.effects
 
 
 def _shown(row: Row) -> dict[str, Any]:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from calib_core import points
+from calib_core.effects import Effect, library
+from calib_core.formula import effect_of
 from calib_core.gap_points import Readings, diagnose
 from calib_core.points import Points
 from calib_core.problem import Problem
@@ -83,6 +85,14 @@ def test_an_effect_of_rate_is_named_with_its_size(effect: object, name: str, par
     assert abs(found["value"] - value) < 4.0 * found["standard_uncertainty"]
 
 
+def test_a_users_own_effect_of_the_rate_is_named_too() -> None:
+    own = effect_of("fifth", "(rate_dps / 100)**5 - (rate_dps / 100)**3", "k", "deg/s", "rate")
+    wavy = made("rate", lambda w: 0.98 * 6.0 * ((w / 100) ** 5 - (w / 100) ** 3))
+    said = diagnose(wavy, suspects={"fifth": own, **_library()})
+    assert named(said) == ["fifth"]
+    assert said["after"]["parameters"][-1]["value"] == pytest.approx(6.0, abs=1.0)
+
+
 def test_a_bias_that_moved_adds_up_over_the_time_written_down() -> None:
     """With moves at two speeds its column is no longer that of asymmetry."""
     speed = np.where(np.arange(len(ANGLES)) % 2, 25.0, 100.0)
@@ -137,7 +147,5 @@ def test_the_command_takes_points_and_tells_each_board_and_axis(
     assert "board 2, axis x, 248 readings" in capsys.readouterr().out
 
 
-def _library() -> dict[str, object]:
-    from calib_core.effects import library
-
+def _library() -> dict[str, type[Effect]]:
     return dict(library())

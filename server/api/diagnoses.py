@@ -1,9 +1,9 @@
-"""What a recording's model is missing, and the effects it can be made of."""
+"""What a recording's model is missing."""
 
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from server import compute, diagnosis
 from server.api.common import Here, Language
@@ -58,36 +58,7 @@ class Diagnosis(Answer):
     next_experiment: dict[str, Any] | None
     after: dict[str, Any] | None
     limits: list[Said]
-
-
-class Parameter(BaseModel):
-    name: str
-    unit: str = Field(description="{out} stands for the recording's unit")
-    typical: float
-    bounds: tuple[float, float]
-    grid: list[float] = Field(description="where the search begins; empty for a linear parameter")
-
-
-class Effect(BaseModel):
-    """One physical effect: where it acts, what it is, how it shows, and how to provoke it."""
-
-    name: str
-    title: str
-    stage: Literal["table", "sensor", "electrics", "acquisition"]
-    needs: list[str]
-    parameters: list[Parameter]
-    summary: str
-    equation: str
-    cause: str
-    signature: str
-    confused_with: str
-    excite_it: str
-    source: str
-
-
-class Effects(BaseModel):
-    items: list[Effect]
-    next: None = None
+    user_effects: list[dict[str, str]] = Field([], description="users' own effects that it names, as formulas")
 
 
 @router.post(
@@ -99,8 +70,3 @@ async def diagnose(recording: str, body: DiagnosisBody, here: Here, lang: Langua
     effects, axes = tuple(dict.fromkeys(body.effects)), (here.supervisor.rig or {}).get("axes", {})
     answer = await here.compute.run(compute.diagnose, here.store.data, recording, body.axis, effects, body.board, axes)
     return Diagnosis.model_validate(diagnosis.told(answer, lang))
-
-
-@router.get("/effects", summary="The effect library: equations, causes, signatures, parameters")
-def effects(lang: Language) -> Effects:
-    return Effects.model_validate({"items": diagnosis.cards(lang)})

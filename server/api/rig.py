@@ -62,7 +62,7 @@ def status(here: Here, lang: Language) -> models.Rig:
 def choose(body: models.RigBody, here: Here, lang: Language, lease: LeaseToken = None) -> models.Rig:
     here.lease.check(lease)
     speed = checked_speed(body.speed, body.url)
-    here.supervisor.open_rig(body.url, speed)
+    here.supervisor.open_rig(here.store.effects.address(body.url), speed)
     return models.Rig(**shown(here, lang))
 
 

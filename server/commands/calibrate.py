@@ -81,10 +81,10 @@ def _run(args: argparse.Namespace) -> dict[str, Any]:
         "spec": spec,
     }
     Path(args.out).mkdir(parents=True, exist_ok=True)  # refused before 45 minutes, not after them
-    with Store(args.data) as store, closing(open_rig(args.rig)) as rig:
+    with Store(args.data) as store, closing(open_rig(store.effects.address(args.rig))) as rig:
         rig.open()
         filled, plan = run_plan.plan_of(store, request, rig.axes)
-        run = run_plan.create(store, filled, plan, rig=args.rig, speed=speed)
+        run = run_plan.create(store, filled, plan, rig=rig.url, speed=speed)
         abort = threading.Event()
         before = signal.signal(signal.SIGINT, lambda *_: abort.set())
         try:

@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _of(file: Path, args: argparse.Namespace) -> list[dict[str, Any]]:
     from server import diagnosis
-    from server.store_effects import suspects_of
+    from server.store_effects import address_of, suspects_of
 
     suspects = suspects_of(args.data)
     if args.rig is None:
@@ -70,7 +70,7 @@ def _of(file: Path, args: argparse.Namespace) -> list[dict[str, Any]]:
     with file.open("rb") as opened:
         hand = read(opened, name=file.name)
     axis = diagnosis.axis_of(hand, args.axis)
-    with closing(open_rig(args.rig)) as rig:
+    with closing(open_rig(address_of(args.rig, args.data))) as rig:
         rig.open()
         answer, both = experiments.run(hand, axis, rig, effects=args.effects, suspects=suspects, most=args.experiments)
     if args.out:

@@ -92,10 +92,12 @@ def _compensation(args: argparse.Namespace) -> "Compensation":
             return Compensation.of_diagnosis(tree, as_asked=args.effects is not None)
         return Compensation.from_json(tree or {"format": f"not {FORMAT}"})
     from server.diagnosis import of_recording
+    from server.store_effects import suspects_of
 
     recording, _ = _load(args.source, args.data)
     effects = [name.strip() for name in (args.effects or "").split(",") if name.strip()]
-    answer = of_recording(recording, axis=args.axis, effects=effects, file=Path(args.source).name)
+    suspects = suspects_of(args.data)
+    answer = of_recording(recording, axis=args.axis, effects=effects, file=Path(args.source).name, suspects=suspects)
     answer["recording"]["digest"] = recording.digest()
     return Compensation.of_diagnosis(answer, as_asked=args.effects is not None)
 

@@ -35,10 +35,12 @@ def main(args: argparse.Namespace) -> int:
 
         from server import auth
         from server.app import create_app
+        from server.store_effects import address_of
 
+        rig = address_of(args.rig, args.data)
         token = None if args.host in LOOPBACK else auth.new_token()
         port = listener.getsockname()[1]
-        app = create_app(Settings(data_dir(args.data), args.host, port, args.rig, speed, token))
+        app = create_app(Settings(data_dir(args.data), args.host, port, rig, speed, token))
         gc.freeze()
         gc.enable()
         config = uvicorn.Config(

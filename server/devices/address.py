@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 from urllib.parse import parse_qsl
 
+from calib_core.formula import from_text
 from calib_core.gyro_models import GyroModel
 from calib_core.problem import Problem
 from calib_core.twin import LATCH_S, Plant, board_truth
@@ -82,8 +83,9 @@ def _emulated(url: str, rest: str) -> Rig:
 
 
 def _twin(url: str, rest: str) -> Rig:
-    options = _query(url, rest, ("seed", "covariates", "effects", "warming"))
-    effects = parse(options.pop("effects", ""))
+    options = _query(url, rest, ("seed", "covariates", "effects", "own", "warming"))
+    own = from_text(options.pop("own", "[]"))
+    effects = parse(options.pop("effects", ""), {effect.name: effect for effect in own})
     warming = _float("warming", options.pop("warming", "0"), 60.0)
     given = {name: _number(name, text) for name, text in options.items()}
     seed = given.get("seed", 1)
