@@ -4,15 +4,17 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote
 
 from sqlite_utils import Database
 
-from calib_core.effects import Effect, library
-from calib_core.formula import UserEffect, from_json, to_json
 from calib_core.problem import Problem
 from server.store_db import FILE, Connection, Row, dumps, migrations, now
+
+if TYPE_CHECKING:
+    from calib_core.effects import Effect
+    from calib_core.formula import UserEffect
 
 MOST = 100
 
@@ -28,6 +30,8 @@ class Effects:
 
     def add(self, given: Mapping[str, object], *, note: str = "") -> Row:
         """Keeps an effect (``formula.to_json``'s keys). Raises Problem ``formula.…``, ``effect.exists``."""
+        from calib_core.formula import from_json, to_json
+
         body = to_json(from_json(given))
         row = {"name": body["name"], "body": dumps(body), "note": note, "created_at": now()}
         with self._at.write() as db:
@@ -54,22 +58,31 @@ class Effects:
 
         Models, certificates and recordings that use it carry its formula, and go on working.
         """
+        from calib_core.effects import library
+
         if name in library():
             raise Problem("effect.of_library", effect=name)
         self.get(name)
         with self._at.write() as db:
             db.table("effects").delete(name)
 
-    def classes(self) -> dict[str, type[UserEffect]]:
+    def classes(self) -> "dict[str, type[UserEffect]]":
         """By name. What a later library has under the same name is left to the library."""
+        from calib_core.effects import library
+        from calib_core.formula import from_json
+
         return {row["name"]: from_json(row) for row in self.find() if row["name"] not in library()}
 
-    def suspects(self) -> dict[str, type[Effect]]:
+    def suspects(self) -> "dict[str, type[Effect]]":
         """The library and the users' own: what a diagnosis may name."""
+        from calib_core.effects import library
+
         return {**library(), **self.classes()}
 
     def address(self, url: str) -> str:
         """A twin's address with the formulas of the users' own effects that it hides: it needs no store then."""
+        from calib_core.formula import to_json
+
         _, _, query = url.partition("?")
         options = dict(parse_qsl(query))
         if not url.startswith("twin:") or "own" in options:
@@ -80,8 +93,10 @@ class Effects:
         return f"{url}&own={quote(dumps(used), safe='')}" if used else url
 
 
-def suspects_of(data: str | Path | None) -> dict[str, type[Effect]]:
+def suspects_of(data: str | Path | None) -> "dict[str, type[Effect]]":
     """``Effects.suspects`` of the store in ``data``; only the library where there is no store yet, and none is made."""
+    from calib_core.effects import library
+
     with _there(data) as effects:
         return effects.suspects() if effects else dict(library())
 
