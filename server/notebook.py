@@ -30,6 +30,8 @@ def _said(step: str, values: Mapping[str, Any]) -> tuple[str, Words]:
         if words.get(name) is not None:
             words[name] = diagnosis.rounded(words[name], 0.0)
     if step == "guessed":
+        if not values.get("effects"):
+            return "guessed_none", words
         words["effects"] = effects(values["effects"])
         if values.get("covariate"):
             return "guessed_along", words | {"along": diagnosis.along(values["covariate"])}

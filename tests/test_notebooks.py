@@ -20,6 +20,7 @@ STEPS: list[dict[str, Any]] = [
     {"step": "guessed", "effects": ["hysteresis"], "covariate": "x_rate_dps", "why": "it jumps\nat reversals"},
     {"step": "guessed", "effects": ["hysteresis", "my_own"]},
     {"step": "seen", "effect": "bandwidth_lag", "two_delta_lnL": 812.34},
+    {"step": "guessed", "why": "only noise"},
     {"step": "seen", "effect": "thermal_lag"},
     {"step": "added", "effects": ["bandwidth_lag"], "before": 0.6123, "after": 0.0812, "floor": 0.079},
     {"step": "removed", "effects": ["bandwidth_lag"], "before": 0.0812, "after": 0.6123},
@@ -66,11 +67,11 @@ def test_every_step_has_a_line_in_both_languages(client: TestClient) -> None:
         said = [line["sentence"] for line in opened["content"]]
         assert (opened["lines"], len(said)) == (len(STEPS), len(STEPS))
         assert not [text for text in said if "{" in text or "notebook." in text or "None" in text]
-        assert "0.612" in said[5]
-        assert "0.079" in said[5]
-        assert "0.2513" in said[7]
-        assert [line["own"] for line in opened["content"]][9] == "#panic() is only text"
-    assert "lag of the sensor or delay" in client.get(f"/notebooks/{made}").json()["content"][10]["sentence"]
+        assert "0.612" in said[6]
+        assert "0.079" in said[6]
+        assert "0.2513" in said[8]
+        assert [line["own"] for line in opened["content"]][10] == "#panic() is only text"
+    assert "lag of the sensor or delay" in client.get(f"/notebooks/{made}").json()["content"][11]["sentence"]
     listed = client.get("/notebooks").json()["items"]
     assert [(item["id"], item["lines"]) for item in listed] == [(made, len(STEPS))]
 

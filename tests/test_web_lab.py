@@ -168,9 +168,9 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         assert (row["name"], row["answer"], row["truth"], row["score"]) == ("Ann", "hysteresis", "hysteresis", "1.0")
 
         bench.reload()
-        bench.wait_for_selector(".card")
+        bench.wait_for_selector(".about svg")
         assert "Right:" in student.text(".mark")
-        assert "reversal" in student.text(".card")
+        assert "reversal" in student.text(".about")
         assert student.widest() <= PHONE["width"]
         teacher.close()
         student.close(refusals=1)

@@ -35,10 +35,10 @@ class Opened(models.Body):
 
 
 class Guessed(models.Body):
-    """A cause picked before the evidence is seen, the picture that failed, and why."""
+    """A cause picked before the evidence is seen (none: nothing is missing), the picture that failed, and why."""
 
     step: Literal["guessed"]
-    effects: Effects
+    effects: list[Name] = Field([], max_length=10)
     covariate: Annotated[str, Field(max_length=64)] | None = None
     why: Text = ""
 

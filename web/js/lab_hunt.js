@@ -8,6 +8,7 @@ import { answerWords, truthList, verdictList } from "./lab_results.js";
 import { lab, remember } from "./lab_student.js";
 import { notebook } from "./notebook.js";
 import { duration, t, when } from "./text.js";
+import { showCard } from "./workbench/card.js";
 
 export async function hunt(main, exercise, student) {
   const { code, axis } = exercise;
@@ -83,13 +84,13 @@ function truthPanel(exercise, student, effects, names) {
       h("div", { class: "stack" }, h("h2", {}, t("lab.your_answer")),
         answer ? verdictList(grade, answer, names) : h("p", {}, t("lab.no_answer")),
         diagnosis ? h("div", { class: "stack" }, h("h3", {}, t("lab.instrument")), h("p", {}, diagnosis.sentence)) : null)),
-    ...effects.filter(({ name }) => hidden.includes(name)).map((effect) => card(effect, names)));
+    ...hidden.map((name) => card(name, new Map(effects.map((effect) => [effect.name, effect])))));
 }
 
-const CARD = ["equation", "cause", "signature", "confused_with", "excite_it", "source"];
-/** Public names of effects in a text, as people call them. */
-const named = (text, names) => text.replace(/[a-z]+(?:_[a-z]+)+|hysteresis|backlash|saturation/g, (word) => names[word] ?? word);
-/** An effect's physics card. */
-const card = (effect, names) => h("article", { class: "card stack" },
-  h("h3", {}, effect.title), h("p", {}, effect.summary),
-  h("dl", { class: "facts" }, CARD.map((key) => h("div", {}, h("dt", {}, t(`lab.card_${key}`)), h("dd", {}, named(effect[key], names))))));
+/** An effect's card; the names in it open theirs in its place. */
+function card(name, cards) {
+  const place = h("article", { class: "about stack" });
+  const open = async (other) => (await showCard(place, other, cards, { open })).focus();
+  showCard(place, name, cards, { open });
+  return place;
+}
