@@ -12,8 +12,9 @@ from calib_core.recording import MAX_BYTES
 from server import problems
 
 READS = {"GET", "HEAD", "OPTIONS"}
+MAX_BATCH_BYTES = 20_000_000_000
 ALWAYS_ALLOWED = "/api/v1/rig/stop"  # the emergency stop is never locked
-LARGEST = {"/api/v1/recordings": MAX_BYTES + (1 << 16)}
+LARGEST = {"/api/v1/recordings": MAX_BYTES + (1 << 16), "/api/v1/batches": MAX_BATCH_BYTES}
 LARGEST_ELSEWHERE = 1 << 20
 
 

@@ -193,6 +193,16 @@ def document(data: Path, number: str, form: str, lang: str) -> bytes:
         return bytes(render(store.certificates.get(number), form, lang=lang))
 
 
+def documents(data: Path, numbers: Sequence[str], lang: str) -> list[tuple[str, bytes]]:
+    """All documents of some certificates, by file name."""
+    from server.documents import FORMATS, render
+    from server.store import Store
+
+    with Store(data) as store:
+        contents = [store.certificates.get(number) for number in numbers]
+    return [(f"{content['number']}.{kind}", render(content, kind, lang)) for content in contents for kind in FORMATS]
+
+
 def thesis() -> dict[str, Any]:
     from calib_core.thesis import report
 

@@ -31,8 +31,15 @@ def read_spec(path: str | None) -> dict[str, Any] | None:
     return spec
 
 
-def certified(content: Mapping[str, Any], out: Path, lang: str, *, file: str | None = None) -> Outcome:
-    """The outcome of an issued certificate, whose documents it writes into ``out``."""
+def certified(
+    content: Mapping[str, Any],
+    out: Path,
+    lang: str,
+    *,
+    file: str | None = None,
+    rendered: Mapping[str, bytes] | None = None,
+) -> Outcome:
+    """The outcome of an issued certificate, whose documents it writes into ``out`` (None: rendered here)."""
     return {
         "file": file,
         "board": content["board"],
@@ -43,7 +50,7 @@ def certified(content: Mapping[str, Any], out: Path, lang: str, *, file: str | N
         "warnings": [
             {**warning, "sentence": documents.warning_sentence(warning, lang)} for warning in content["warnings"]
         ],
-        "documents": write_documents(content, out, lang),
+        "documents": write_documents(content, out, lang, rendered),
         "recording": content["recording"]["id"],
     }
 
@@ -64,7 +71,9 @@ def failed(problem: Problem, lang: str, *, board: str | None = None, file: str |
     }
 
 
-def write_documents(content: Mapping[str, Any], out: Path, lang: str) -> dict[str, str]:
+def write_documents(
+    content: Mapping[str, Any], out: Path, lang: str, rendered: Mapping[str, bytes] | None = None
+) -> dict[str, str]:
     """One file a format, named after the certificate; each is whole or absent."""
     out.mkdir(parents=True, exist_ok=True)
     written = {}
@@ -72,7 +81,7 @@ def write_documents(content: Mapping[str, Any], out: Path, lang: str) -> dict[st
         path = out / f"{content['number']}.{kind}"
         part = path.with_name(f".{path.name}.part")
         try:
-            part.write_bytes(documents.render(content, kind, lang))
+            part.write_bytes(rendered[kind] if rendered else documents.render(content, kind, lang))
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 from calib_core.recording import Recording
 from server.settings import data_dir
+from server.store_batches import Batches
 from server.store_boards import Boards, GyroModels
 from server.store_certificates import Certificates
 from server.store_db import Connection
@@ -36,6 +37,7 @@ class Store:
         self.rig_records = RigRecords(self.connection)
         self.notebooks = Notebooks(self.connection)
         self.lab = Lab(self.connection)
+        self.batches = Batches(self.connection)
 
     def recording(self, recording: str) -> Recording:
         return self.recordings.load(recording)

@@ -120,6 +120,19 @@ def _owners(db: Database) -> None:
     db.table("runs").add_column("owner", str)
 
 
+SEARCHED = "number || ' ' || board || ' ' || operator"
+
+
+@migrations(name="0012_search")
+def _search(db: Database) -> None:
+    """What is looked for among 10^5: boards' certificates and recordings, a recording that is here already, and one
+    text a certificate to search, so that a search reads an index and not the certificates."""
+    db.table("certificates").create_index(["board"])
+    db.execute(f"create index idx_certificates_search on certificates ({SEARCHED})")
+    db.table("recordings").create_index(["board"])
+    db.table("recordings").create_index(["digest"])
+
+
 class Connection:
     """One connection for all threads of a process, a lock around it; other processes wait for SQLite's own."""
 

@@ -58,11 +58,31 @@ class Recordings:
         found = self._at.rows("select data from blocks where recording = ? and kind = 'points'", [recording])
         return read(zlib.decompress(found[0]["data"])) if found else None
 
+    def keep(self, packed: Mapping[str, Any], *, board: str, name: str, source: str = "upload") -> str:
+        """A complete recording that was packed elsewhere (`batch_work.certify`); the same one is kept once."""
+        same = "select id, header from recordings where digest = ? and board = ?"
+        with self._at.write() as db:
+            for row in self._at.rows(same, [packed["digest"], board]):
+                if json.loads(row["header"]) == packed["header"]:
+                    return str(row["id"])
+            recording = self.create(board=board, name=name, source=source, header=packed["header"])
+            db.table("recordings").update(recording, {key: packed[key] for key in ("digest", "samples", "duration_s")})
+            self._insert_block(recording, packed["data"], samples=packed["samples"], end_s=packed["end_s"])
+        return recording
+
     def append(self, recording: str, rows: Recording, *, state: str, kind: str = "rows", live: bool = True) -> None:
         """A block of rows after the last; ``kind`` "fast" holds the 1 kHz file's."""
+        end_s = float(rows.time_s[-1]) if len(rows) else 0.0
+        packed = pack_recording(rows)
+        self._insert_block(recording, packed, samples=len(rows), end_s=end_s, kind=kind, state=state, live=live)
+
+    def _insert_block(
+        self, recording: str, data: bytes, *, samples: int, end_s: float, kind: str = "rows", state: str = "",
+        live: bool = False,
+    ) -> None:  # fmt: skip
         block = {
-            "recording": recording, "kind": kind, "state": state, "live": int(live), "samples": len(rows),
-            "end_s": float(rows.time_s[-1]) if len(rows) else 0.0, "data": pack_recording(rows),
+            "recording": recording, "kind": kind, "state": state, "live": int(live), "samples": samples,
+            "end_s": end_s, "data": data,
         }  # fmt: skip
         names = ", ".join(block)
         marks = ", ".join("?" * len(block))

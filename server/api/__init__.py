@@ -7,6 +7,7 @@ import sys
 sys.modules.setdefault("pydantic.v1", None)  # type: ignore[arg-type]
 
 from server.api import (  # noqa: E402
+    batches,
     boards,
     certificates,
     diagnoses,
@@ -39,5 +40,6 @@ ROUTERS = (
     notebooks.router,
     lab.router,
     certificates.router,
+    batches.router,
     thesis.router,
 )

@@ -7,6 +7,7 @@ from fastapi import Depends, Query
 from starlette.requests import HTTPConnection
 
 from server import texts
+from server.batch import BatchProcess
 from server.compute import Compute
 from server.lease import Lease
 from server.settings import Settings
@@ -25,13 +26,16 @@ class Services:
         self.lease = Lease()
         self.compute = Compute()
         self.supervisor = Supervisor(settings, self.store)
+        self.batches = BatchProcess(self.store)
 
     def start(self) -> None:
         self.store.runs.interrupt_open()
         self.supervisor.start()
+        self.batches.resume()
 
     def close(self) -> None:
         self.supervisor.close()
+        self.batches.close()
         self.compute.close()
         self.store.close()
 
