@@ -45,7 +45,7 @@ def test_the_pdf_says_who_what_when_how_and_how_sure_on_two_pages(content: dict[
         "Certificate of calibration", "GB-2026-00042", BOARD, "Ada", "24.5 °C", "2026-11-22 06:10 – 06:55 UTC",
         "2026-11-22 07:10 UTC", "gyrobench 0.", "standard", "Simulated bench", "Reference not calibrated",
         "Fail: 1 of 2 limits of “lab 2026”", "relate only to the item", "Decision rule", "Authorised by",
-        "x Rate test: Non-linearity, %FS ≤ 0",
+        "Rate test: Non-linearity, %FS ≤ 0", "not met",
         "End of certificate", "page 2 of 2", "3 readings at each repeat set-point instead of the 22",
     ):  # fmt: skip
         assert words in said, words
@@ -53,6 +53,22 @@ def test_the_pdf_says_who_what_when_how_and_how_sure_on_two_pages(content: dict[
     for field in FIELDS:
         for axis in "xz":
             assert field.written(content["axes"][axis]).replace("-", "−") in said, field
+
+
+@pytest.mark.parametrize("lang", LANGUAGES)
+def test_a_specification_of_every_figure_still_leaves_two_pages(lang: str) -> None:
+    axes: dict[str, Any] = {}
+    for axis in "xz":
+        for field in FIELDS:
+            node = axes.setdefault(axis, {})
+            for name in field.path[:-1]:
+                node = node.setdefault(name, {})
+            node[field.path[-1]] = {"min": -0.5, "max": 2.5}
+    issued = {"number": "GB-2026-00042", "issued_at": "2026-11-22T07:10:00.654321Z"}
+    spec = {"name": "everything", "axes": axes}
+    whole = {**certify.content(session_recording(), "rec1", spec=spec), **issued}
+    assert len(whole["judgement"]) == 2 * len(FIELDS)
+    assert len(PdfReader(io.BytesIO(documents.render(whole, "pdf", lang))).pages) == 2
 
 
 def test_every_word_on_the_certificate_has_a_text_in_both_languages(content: dict[str, Any]) -> None:

@@ -65,8 +65,9 @@ def page(content: Mapping[str, Any], lang: str) -> dict[str, Any]:
         "statements": [{"title": say(f"{name}.title"), "text": text} for name, text in _statements(content, lang)],
         "spec": {
             "title": say("spec", name=(content["spec"] or {}).get("name") or "–"),
-            "head": [say(f"limits.{name}") for name in ("figure", "limit", "value", "outcome")],
-            "rows": list(_limits(content, lang)),
+            "head": [say(f"limits.{name}") for name in ("figure", "limit")],
+            "failed": say("limits.not_ok"),
+            "rows": _limits(content, lang),
         },
         "warnings": {
             "title": say("warnings"),
@@ -215,22 +216,19 @@ def _errors(set_point: float, of_axis: Sequence[Mapping[float, Mapping[str, Any]
             yield "–" if value is None else signed(f"{value:.{decimals}f}")
 
 
-def _limits(content: Mapping[str, Any], lang: str) -> Iterator[list[str]]:
-    for row in content["judgement"]:
-        field = BY_PATH[tuple(name for name in row["path"] if name != "value")]
+def _limits(content: Mapping[str, Any], lang: str) -> list[dict[str, Any]]:
+    """One row a figure and its limits, with what each axis that they hold for has measured."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for limit in content["judgement"]:
+        field = BY_PATH[tuple(name for name in limit["path"] if name != "value")]
         low, high, value = (
-            None if row[key] is None else f"{row[key] * field.factor:.5g}" for key in ("min", "max", "value")
+            None if limit[key] is None else f"{limit[key] * field.factor:.5g}" for key in ("min", "max", "value")
         )
-        bounds = [f"≥ {low}" if low else "", f"≤ {high}" if high else ""]
-        outcome = render(f"certificate.limits.{'ok' if row['ok'] else 'not_ok'}", {}, lang)
-        name = f"{row['axis']}  {figure_name(field, lang)}, {field.unit}"
-        yield [
-            name,
-            signed(", ".join(filter(None, bounds))),
-            signed(value or "–"),
-            outcome,
-            "ok" if row["ok"] else "fail",
-        ]
+        bounds = signed(", ".join(filter(None, (low and f"≥ {low}", high and f"≤ {high}"))))
+        name = f"{figure_name(field, lang)}, {field.unit}"
+        row = rows.setdefault((name, bounds), {"figure": name, "limit": bounds, "axes": {}})
+        row["axes"][limit["axis"]] = {"value": signed(value or "–"), "ok": bool(limit["ok"])}
+    return [{**row, "axes": [row["axes"].get(axis) for axis in content["axes"]]} for row in rows.values()]
 
 
 # --- plots -----------------------------------------------------------------------------------------------------------
