@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 Operator = Any  # a scipy.sparse matrix
 
 TOGETHER_S = 0.04
-KEPT = 0.98
+KEPT = 0.91
 """Of the square of a reference rate's slope, what its means must keep: the slope is what lateness looks like."""
 
 

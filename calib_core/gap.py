@@ -17,7 +17,7 @@ from calib_core import covariates, gap_saturation
 from calib_core.effects import Effect, library
 from calib_core.gap_checks import Check, checks
 from calib_core.gap_error import Explanation
-from calib_core.gap_search import SHARE, Search, Suspicion
+from calib_core.gap_search import Search, Suspicion
 from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_unknown import CERTAIN, Structure, structures
@@ -27,6 +27,8 @@ from calib_core.recording import Recording
 
 F64 = NDArray[np.float64]
 
+FORM = 0.03
+"""Structure that explains less than this share of what has a name is the name's form, which is never quite right."""
 AGREED = 2.0
 """Of χ² on data not seen, what an effect must take away."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
@@ -182,7 +184,7 @@ def _structure(answer: Diagnosis, search: Search) -> None:
     """Flags what no library effect explains; names that do not pass beside it are dropped."""
     found = structures(search.space, search.chosen)
     explained = search.chi2([]) - search.chi2(search.chosen)
-    if not found or found[0].z < CERTAIN or found[0].gain < SHARE * explained:
+    if not found or found[0].z < CERTAIN or found[0].gain < FORM * explained:
         return
     answer.unknown = found[0]
     names = {t.name for t in search.chosen[search.given :]}

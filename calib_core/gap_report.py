@@ -132,8 +132,8 @@ def parameters(explanation: Explanation) -> list[dict[str, Any]]:
     at = space.base.shape[1]
     for term in explanation.terms:
         own = term.effect.parameters()
-        if not term.fixed:
-            for k, name in enumerate(term.names):
+        for k, name in enumerate(term.names):
+            if name:
                 size = (float(values[at + k]), spread[at + k])
                 rows.append(_parameter(f"{term.name}.{name}", size[0], _unit(own[name].unit, unit), size[1]))
         for name, value in zip(term.effect.nonlinear(), term.setting, strict=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
@@ -18,14 +19,22 @@ F64 = NDArray[np.float64]
 FALSE_ALARM = 0.01
 """Of a healthy record given anything at all; designing at 2 % fails a 2 % bar as often as not."""
 DRAWS = 4000
-SHARE = 0.004
-"""A new term must buy this share of what is explained already: the form of a big effect is never quite right."""
+SHARE, SHARE_RATE = 0.004, 0.04
+"""A new term must buy this share of what is explained already: the form of a big effect is never quite right, and a
+reference rate has errors that follow the motion."""
+REST = 0.1
+"""Or this share of what is left: then the form is not what is meant."""
 RIVAL = 6.0
 """2ΔlnL within which two explanations cannot be told apart."""
 MOST = 3
 STEP_EVERY_S = 4.0
 CLEAN = 1e-3
 """Of a column's square, what must be its own to stand beside others while the noise is estimated."""
+FIELD = 8
+"""So many classes are refined before one is chosen."""
+LATE_TURNS = 6
+PLAIN = 8.0
+"""|z| of what is refined before the noise is estimated."""
 NOISE_COMPANY = 8
 """So many best classes stand in the model while the noise is estimated."""
 
@@ -101,6 +110,16 @@ class Search:
         self._projected, self._places = projected, places[len(kept) :]
         return gram, sorted(best.values(), key=lambda s: -s.z)
 
+    def _beside(self, terms: Sequence[Term]) -> tuple[F64, F64]:
+        """Orthonormal columns (n, h) of base and ``terms``, whitened, and what they leave of the residual (n,)."""
+        space = self.space
+        free = [space.whitened(t) for t in terms if not t.fixed]
+        held = np.column_stack([space.white(space.base), *free])
+        size = np.sqrt(np.einsum("ij,ij->j", held, held))
+        span, _ = np.linalg.qr(held[:, size > 0.0] / size[size > 0.0])
+        left = space.white(space.residual - sum(t.columns[:, 0] for t in terms if t.fixed))
+        return span, left - span @ (span.T @ left)
+
     def null_tail(self, terms: Sequence[Term]) -> float:
         """The (1 - FALSE_ALARM) quantile of the best z over all ``terms`` in a record where nothing is missing."""
         own = np.diag(self._projected)
@@ -137,9 +156,9 @@ class Search:
     def _free(self, terms: Sequence[Term], *, folds: bool = False) -> tuple[Gram, list[int]]:
         """The terms' Gram matrix, and which of its columns have a coefficient that is not known to be one."""
         gram = self.space.gram(terms, folds=folds)
-        places = _places(terms, gram.base)
-        fixed = [k for t, p in zip(terms, places, strict=True) if t.fixed for k in p]
-        free = [k for t, p in zip(terms, places, strict=True) if not t.fixed for k in p]
+        named = [name for t in terms for name in t.names]
+        fixed = [k for k, name in enumerate(named, 1 + gram.base) if not name]
+        free = [k for k, name in enumerate(named, 1 + gram.base) if name]
         return (gram.known(dict.fromkeys(fixed, 1.0)) if fixed else gram), free
 
     def refined(self, term: Term, others: Sequence[Term], kept: Collection[str] = ()) -> tuple[Term, float]:
@@ -178,46 +197,45 @@ class Search:
         now = self.chi2(others)
         tried = [self.space.term(term.effect, (*term.setting[:k], v, *term.setting[k + 1 :])) for v in grid]
         chi2 = [self.chi2([*others, t]) for t in tried]
-        z = [float(equivalent_z(now - x, len(t.names))) for t, x in zip(tried, chi2, strict=True)]
+        z = [float(equivalent_z(now - x, t.freedom)) for t, x in zip(tried, chi2, strict=True)]
         best = max(range(len(z)), key=z.__getitem__)
         return tried[best], chi2[best]
 
     def _refined_late(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
-        for _ in range(3):
+        for _ in range(LATE_TURNS):
             tau = self.value(term, others)
             if term.name == "angular_acceleration":
                 tau = -tau
+            if term.setting and abs(tau - term.setting[0]) < 1e-3 * abs(tau):
+                break
             term = self.space.term(term.effect, [tau])
         return term, self.chi2([*others, term])
 
     def value(self, term: Term, others: Sequence[Term]) -> float:
         """The coefficient of ``term``'s one column beside ``others``."""
-        gram = self.space.gram([*others, term])
-        last = gram.matrix.shape[0] - 1
-        return float(gram.coefficients(list(range(1 + gram.base, last + 1)))[0][-1])
+        gram, free = self._free([*others, term])
+        return float(gram.coefficients(free)[0][-1])
 
     def run(self, most: int = MOST) -> None:
         """Adds effects one by one while the best passes the threshold and buys its share; fills ``findings``."""
         while True:
             ranking = self.prepare()
             # Half of the noise's uncertainty is that of every z.
-            self.threshold = self.null_tail(self.terms()) * (1.0 + 0.5 * self.space.doubt)
+            self.threshold = self.null_tail(self.terms()) * (1.0 + 0.5 * min(self.space.doubt, 1.0))
             self.last = ranking
             sure = {s.term.name for s in ranking if s.sure >= self.threshold}
             if not sure or len(self.chosen) - self.given >= most:
                 return
-            now = self.chi2(self.chosen)
-            rivals: list[Suspicion] = []
-            for s in ranking:
-                if s.z < 0.5 * ranking[0].z or len(rivals) >= 8:
-                    break
-                term, chi2 = self.refined(s.term, self.chosen)
-                if not (term.effect.positive and self.value(term, self.chosen) < 0.0):
-                    rivals.append(Suspicion(term, now - chi2, float(equivalent_z(now - chi2, len(term.names)))))
-            rivals.sort(key=lambda s: -s.gain)
-            while rivals and rivals[0].term.name not in sure:
+            rivals = self._field(ranking)
+            held, left = self._beside(self.chosen)
+            while rivals and not (
+                rivals[0].term.name in sure
+                and rivals[0].z >= self.threshold * math.sqrt(self.space.unrest(rivals[0].term, held, left))
+            ):
                 del rivals[0]
-            if not rivals or rivals[0].gain < SHARE * (self.chi2([]) - now):
+            rest = self.chi2(self.chosen)
+            share = SHARE_RATE if self.space.design.reference == "rate" else SHARE
+            if not rivals or rivals[0].gain < min(share * (self.chi2([]) - rest), REST * rest):
                 return
             simplest = min((s for s in rivals if rivals[0].gain - s.gain < 1.0), key=lambda s: len(s.term.setting))
             self.findings.append(Finding(simplest, rivals, self.threshold))
@@ -227,8 +245,24 @@ class Search:
     def prepare(self) -> list[Suspicion]:
         """Estimates the noise beside the chosen and the best classes, and ranks all classes with it."""
         gram, ranking = self.scan()
-        self.space.refit_noise([*self.chosen, *self._company(gram, ranking)])
+        company = self._company(gram, ranking)
+        if ranking and ranking[0].z > PLAIN:
+            # What is not quite its shape would pose as noise.
+            company = [self.refined(t, self.chosen)[0] if t is ranking[0].term else t for t in company]
+        self.space.refit_noise([*self.chosen, *company])
         return self.scan()[1]
+
+    def _field(self, ranking: Sequence[Suspicion]) -> list[Suspicion]:
+        """The best classes, refined beside the chosen, best first."""
+        now = self.chi2(self.chosen)
+        field: list[Suspicion] = []
+        for s in ranking:
+            if s.z < 0.5 * ranking[0].z or len(field) >= FIELD:
+                break
+            term, chi2 = self.refined(s.term, self.chosen)
+            if not (term.effect.positive and self.value(term, self.chosen) < 0.0):
+                field.append(Suspicion(term, now - chi2, float(equivalent_z(now - chi2, term.freedom))))
+        return sorted(field, key=lambda s: -s.gain)
 
     def rivals(self) -> list[list[Suspicion]]:
         """For each chosen effect, every effect that would serve in its place, the others kept: itself first or near."""
@@ -259,7 +293,7 @@ class Search:
             weakest, least = self.given, np.inf
             for k in range(self.given, len(self.chosen)):
                 gain = self.chi2([*self.chosen[:k], *self.chosen[k + 1 :]]) - both
-                z = float(equivalent_z(gain, len(self.chosen[k].names)))
+                z = float(equivalent_z(gain, self.chosen[k].freedom))
                 if z < least:
                     weakest, least = k, z
             if least >= self.findings[weakest - self.given].threshold:

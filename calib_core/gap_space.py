@@ -7,7 +7,7 @@ complement, thresholds, errors on data left out) is asked of small matrices. MET
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -27,6 +27,8 @@ F64 = NDArray[np.float64]
 OVERSTATED = 2.0
 FEIGNED_STEPS = 0.014
 """A shape of this size, RMS in encoder steps, may come from the codes themselves."""
+LATE = 0.01
+"""Lateness below this share of a sampling interval is as good as none."""
 REMEMBERED = 24
 """So many terms beside the listed ones are kept whitened."""
 TOGETHER = 16
@@ -42,7 +44,7 @@ class Term:
     effect: type[Effect]
     setting: tuple[float, ...]
     names: tuple[str, ...]
-    """The linear parameters that the columns belong to; ("",) where the effect's size is its setting."""
+    """The linear parameters that the columns belong to; "" for a column whose coefficient is one."""
     columns: F64
     slack: F64
     """(p,) variance of each coefficient that the encoder's codes may feign: their error is not quite noise."""
@@ -50,6 +52,11 @@ class Term:
     @property
     def name(self) -> str:
         return self.effect.name
+
+    @property
+    def freedom(self) -> int:
+        """How many coefficients are free; one where a setting is all there is."""
+        return max(1, sum(map(bool, self.names)))
 
     @property
     def fixed(self) -> bool:
@@ -186,6 +193,9 @@ class Space:
 
     def _shapes(self, effect: type[Effect], setting: Sequence[float]) -> tuple[tuple[str, ...], Acts, F64]:
         if effect.curvature is not None:
+            if self.design.readings is None:
+                shapes = self._answered(effect, setting[0] if setting else 0.0)
+                return (("",) * (shapes.shape[1] - 1)) + effect.linear(), Acts.RATE, shapes
             return effect.linear(), Acts.ANGLE, self._late(effect, setting)
         named = effect.columns(self.covariates, **dict(zip(effect.nonlinear(), setting, strict=True)))
         return tuple(named), effect.acts, np.column_stack([*named.values()])
@@ -226,11 +236,37 @@ class Space:
         tau = setting[0] if setting else 0.0
         shape = self._felt()
         if tau:
-            # In terms of the true rate, which only a reference rate tells, the series turns round.
-            bend = effect.curvature if self.design.readings is not None else effect.curvature - 1.0
-            shape = shape + bend * tau * np.gradient(shape, self.covariates.interval_s)
+            shape = shape + effect.curvature * tau * np.gradient(shape, self.covariates.interval_s)
         sign = -1.0 if effect.name == "angular_acceleration" else 1.0
         return sign * shape[:, None]
+
+    def _answered(self, effect: type[Effect], tau: float) -> F64:
+        """(k, 1) what an answer late by little adds to a reference rate, for each second of lateness; (k, 2) about
+        the lateness ``tau`` what it adds by itself, and how that changes."""
+        c = self.covariates
+        slope = np.gradient(c.rate_dps, c.interval_s)
+        if effect.name == "angular_acceleration":
+            return slope[:, None]
+        if abs(tau) < LATE * c.interval_s or (effect.curvature == 0.0 and tau < 0.0):
+            return -slope[:, None]
+
+        def answer(tau: float) -> F64:
+            if effect.curvature == 0.0:
+                return replace(c, memory={}).lagged(c.rate_dps, tau, "")
+            return self._curve(c.time_s - tau)
+
+        little = 0.02 * abs(tau)
+        change = (answer(tau + little) - answer(tau - little)) / (2.0 * little)
+        return np.column_stack([answer(tau) - c.rate_dps - tau * change, change])
+
+    @cached_property
+    def _curve(self) -> Callable[[F64], F64]:
+        """The reference rate between its samples; a straight line there would be a filter."""
+        from scipy.interpolate import CubicSpline
+
+        c = self.covariates
+        spline = CubicSpline(c.time_s, c.rate_dps)
+        return lambda at_s: np.asarray(spline(np.clip(at_s, c.time_s[0], c.time_s[-1])))
 
     def white(self, columns: F64) -> F64:
         """(n, p) whitened columns."""
@@ -238,6 +274,8 @@ class Space:
 
     def whitened(self, term: Term) -> F64:
         """(n, p) the term's columns, whitened."""
+        if id(term) in self._places and self._bank is not None:
+            return self._bank.white[:, self._places[id(term)]].astype(float)
         if id(term) not in self._whitened:
             if len(self._whitened) >= REMEMBERED:
                 del self._whitened[next(iter(self._whitened))]
@@ -261,6 +299,26 @@ class Space:
         order = [k if k >= 0 else len(inside) - 1 - k for k in order]
         parts = bank.parts_with(inside, own, folds=folds)
         return Gram(parts[:, order][:, :, order], self.prior)
+
+    def unrest(self, term: Term, held: F64, left: F64) -> float:
+        """How much more the evidence for ``term`` scatters from block to block than the noise model has it, 1 or more.
+
+        ``held`` (n, h) are orthonormal whitened columns of what is in the model, ``left`` (n,) the whitened residual
+        beside them. Errors that come and go, and models of the wrong form, are uncertain in a way that no likelihood
+        knows; scatter that blocks as few as these may show by chance does not count.
+        """
+        white = self.whitened(term)
+        free = white - held @ (held.T @ white)
+        along = free @ (np.ones(1) if term.fixed else np.linalg.lstsq(free, left, rcond=1e-6)[0])
+        begin = self.folds.edges[:-1]
+        score, own = np.add.reduceat(along * left, begin), np.add.reduceat(along**2, begin)
+        whole = float(own.sum())
+        if whole <= 0.0:
+            return 1.0
+        variance = own * (1.0 - own / whole)
+        scatter = float(np.sum((score - own * (score.sum() / whole)) ** 2) / variance.sum())
+        freedom = float(variance.sum() ** 2 / np.sum(variance**2))
+        return max(1.0, scatter / (1.0 + 2.0 * math.sqrt(2.0 / freedom)))
 
     @property
     def bank(self) -> Bank:
