@@ -101,6 +101,12 @@ def concise(value: float, uncertainty: float) -> str:
     return f"{value:.{decimals}f}({digits.removeprefix('0.').lstrip('0') if digits < '1' else digits})"
 
 
+def scaled(value: float, uncertainty: float) -> str:
+    """``concise``, small values by a power of a thousand, as a person writes them: ``-4.45(48)e-6``."""
+    power = max(0, -3 * math.floor(math.log10(abs(value)) / 3.0)) if 0.0 < abs(value) < 1e-3 else 0
+    return concise(value * 10.0**power, uncertainty * 10.0**power) + (f"e-{power}" if power else "")
+
+
 def two_digits(uncertainty: float) -> str:
     """An uncertainty > 0 to two significant digits, without an exponent: 0.000084, 0.10, 1.2, 120."""
     decimals = _decimals(uncertainty)

@@ -21,6 +21,9 @@ TURNING_DPS = 1.5
 COVARIATE_S = 0.5
 """Temperature and supply are smoothed over this: they change slowly, their converters do not know that."""
 
+OTHER_S = 0.05
+"""The other axis' rate is the difference of its encoder, smoothed over this."""
+
 
 def of(recording: Recording, axis: str, design: Design, bias: float, scale_factor: float) -> Covariates:
     """Covariates (k,) at the gyro's samples of ``design``, given the output's bias and scale factor."""
@@ -49,7 +52,7 @@ def of(recording: Recording, axis: str, design: Design, bias: float, scale_facto
         tilt = position if axis == "x" else (_angle(recording, "x", s.time_s) if other == "x" else None)
     other_rate = None
     if other is not None:
-        other_rate = np.gradient(_smooth(_angle(recording, other, s.time_s), 0.05 / interval), interval)
+        other_rate = np.gradient(_smooth(_angle(recording, other, s.time_s), OTHER_S / interval), interval)
     force = {
         a: np.nan_to_num(recording.columns[f"{a}_acceleration_g"][s.index])
         for a in "xyz"

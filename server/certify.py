@@ -2,8 +2,9 @@
 
     store or file -> Recording -> session.analyse -> content -> store (insert only)
 
-Content depends on the recording (its header included), gyro model, specification and software version alone, and
-names all four, so that anyone can compute it again; number and day of issue come from the store.
+Content depends on the recording (its header included), gyro model, specification, software version and the saved model
+that it is compensated by alone, and names them all, so that anyone can compute it again; number and day of issue come
+from the store.
 """
 
 import math
@@ -30,14 +31,23 @@ MORE_SHOWN = 20
 
 
 def certify(
-    store: Store, recording_id: str, *, gyro_model: GyroModel | None = None, spec: Mapping[str, Any] | None = None
+    store: Store,
+    recording_id: str,
+    *,
+    gyro_model: GyroModel | None = None,
+    spec: Mapping[str, Any] | None = None,
+    compensation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Analyses a stored recording and issues its certificate; the issued content, number included.
+
+    ``compensation`` (a saved model as ``compensated_by`` gives it): the axis is certified with its effects taken out.
 
     Raises Problem where the recording, the specification or the store does not allow it; then nothing is issued.
     """
     return store.issue_certificate(
-        content(store.recording(recording_id), recording_id, gyro_model=gyro_model, spec=spec)
+        content(
+            store.recording(recording_id), recording_id, gyro_model=gyro_model, spec=spec, compensation=compensation
+        )
     )
 
 
@@ -47,11 +57,12 @@ def content(
     *,
     gyro_model: GyroModel | None = None,
     spec: Mapping[str, Any] | None = None,
+    compensation: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What a certificate says, without number and date of issue."""
     if spec is not None:
         limits(spec)  # refused before the work, not after it
-    found = session.analyse(recording, gyro_model=gyro_model)
+    found = session.analyse(_without(recording, compensation), gyro_model=gyro_model)
     verdict, judgement = judge(found.axes, spec)
     header = recording.header
     rig = header.get("rig", "")
@@ -84,7 +95,25 @@ def content(
         "spec": spec,
         "verdict": verdict,
         "judgement": judgement,
+        **({} if compensation is None else {"compensation": dict(compensation)}),
     }
+
+
+def compensated_by(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """A saved model as a certificate states it: what it is called, and all that computes it again."""
+    from server.store_models import compensation_of
+
+    told = compensation_of(saved).to_json()
+    return told | {"model": saved["id"], "name": saved["name"], "error": saved["error"], "software": saved["software"]}
+
+
+def _without(recording: Recording, compensation: Mapping[str, Any] | None) -> Recording:
+    if compensation is None:
+        return recording
+    from calib_core.compensation import Compensation
+    from calib_core.corrected import corrected
+
+    return corrected(recording, Compensation.from_json(compensation))
 
 
 def verify(certificate: Mapping[str, Any], recording: Recording) -> dict[str, Any]:
@@ -93,7 +122,11 @@ def verify(certificate: Mapping[str, Any], recording: Recording) -> dict[str, An
     """
     known = certificate["recording"]
     again = content(
-        recording, known["id"], gyro_model=GyroModel.from_json(certificate["gyro_model"]), spec=certificate["spec"]
+        recording,
+        known["id"],
+        gyro_model=GyroModel.from_json(certificate["gyro_model"]),
+        spec=certificate["spec"],
+        compensation=certificate.get("compensation"),
     )
     names = ("axes", "verdict", "judgement", "profile", "board")
     differences = [found for name in names for found in _compare(name, certificate[name], again[name])]

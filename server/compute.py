@@ -4,6 +4,7 @@ Every function here is named by the caller and run there; it opens the store by 
 """
 
 import asyncio
+import json
 import multiprocessing
 import os
 import signal
@@ -16,6 +17,8 @@ from calib_core.problem import Problem
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
+
+    from calib_core.compensation import Compensation
 
 T = TypeVar("T")
 
@@ -132,10 +135,14 @@ def comparison(data: Path, recording: str, axis: str, max_points: int) -> dict[s
 
 
 def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, Any] | None) -> dict[str, Any]:
+    """``model``: a gyro model, or a saved model whose effects are taken out first."""
     from server import certify as room
     from server.store import Store
 
     with Store(data) as store:
+        if model is not None and model in store.models:
+            saved = room.compensated_by(store.models.get(model))
+            return dict(room.certify(store, recording, spec=spec, compensation=saved))
         gyro_model = store.gyro_models.get(model) if model else None
         return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec))
 
@@ -173,6 +180,29 @@ def example(data: Path, name: str) -> str:
 
     with Store(data) as store:
         return examples.made(store, name)
+
+
+def save_model(data: Path, name: str, recording: str, axis: str, effects: Sequence[str], note: str) -> str:
+    from server.store_models import save
+
+    return save(data, name, recording, axis, effects, note)
+
+
+def export_model(data: Path, model: str, form: str) -> str:
+    """A saved model as "json", "h" or "py"."""
+    from server.store import Store
+    from server.store_models import compensation_of
+
+    with Store(data) as store:
+        return compensation_text(compensation_of(store.models.get(model)), form)
+
+
+def compensation_text(compensation: "Compensation", form: str) -> str:
+    from calib_core.compensation_code import write_c, write_python
+
+    if form == "json":
+        return json.dumps(compensation.to_json(), indent=1, ensure_ascii=False) + "\n"
+    return {"h": write_c, "py": write_python}[form](compensation)
 
 
 def verify(data: Path, number: str) -> dict[str, Any]:

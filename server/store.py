@@ -16,6 +16,7 @@ from server.store_db import Connection
 from server.store_effects import Effects
 from server.store_experiments import Experiments
 from server.store_lab import Lab
+from server.store_models import Models
 from server.store_notebooks import Notebooks
 from server.store_recordings import Recordings
 from server.store_rig import RigRecords
@@ -32,6 +33,7 @@ class Store:
         self.runs = Runs(self.connection)
         self.recordings = Recordings(self.connection)
         self.certificates = Certificates(self.connection)
+        self.models = Models(self.connection)
         self.effects = Effects(self.connection)
         self.experiments = Experiments(self.connection)
         self.rig_records = RigRecords(self.connection)

@@ -18,9 +18,11 @@ class Certificates:
     def issue(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Numbers and keeps a certificate: one transaction, on disk when this returns.
 
-        The same recording, gyro model, specification and software version give the certificate that is there already.
+        The same recording, gyro model, specification, software version and compensation give the certificate that is
+        there already.
         """
         named = [content["recording"]["id"], content["gyro_model"], content.get("spec"), content["software"]["version"]]
+        named += [content["compensation"]] if content.get("compensation") else []
         key = hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()
         with self._at.write(durable=True) as db:
             there = self._at.rows("select content from certificates where key = ?", [key])

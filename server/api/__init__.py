@@ -21,6 +21,7 @@ from server.api import (  # noqa: E402
     recordings,
     rig,
     runs,
+    saved_models,
     thesis,
     workbench,
 )
@@ -36,6 +37,7 @@ ROUTERS = (
     diagnoses.router,
     workbench.router,
     effects.router,
+    saved_models.router,
     experiments.router,
     notebooks.router,
     lab.router,

@@ -218,7 +218,7 @@ class Recordings(BaseModel):
 
 class CertificateBody(Body):
     recording: str = Field(max_length=64)
-    model: ModelId | None = None
+    model: ModelId | None = Field(None, description="a gyro model, or a saved model whose effects are taken out first")
     spec: dict[str, Any] | None = None
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -118,18 +117,13 @@ def _errors(answer: dict[str, Any], lang: str) -> list[str]:
 
 
 def _parameters(parameters: Sequence[Mapping[str, Any]], lang: str) -> list[str]:
-    from calib_core.certificate import concise
+    from calib_core.certificate import scaled
 
     def name(full: str) -> str:
         plain = next((key for key in ("bias", "scale_factor") if full.startswith(f"{key}_") and "." not in full), "")
         return render(f"diagnosis.{plain}", {}, lang) if plain else full
 
-    def number(value: float, uncertainty: float) -> str:
-        """Small ones by a power of a thousand, as a person writes them: -4.45(48)e-6."""
-        power = max(0, -3 * math.floor(math.log10(abs(value)) / 3.0)) if 0.0 < abs(value) < 1e-3 else 0
-        return concise(value * 10.0**power, uncertainty * 10.0**power) + (f"e-{power}" if power else "")
-
-    rows = [(name(p["name"]), number(p["value"], p["standard_uncertainty"] or 0.0), p["unit"]) for p in parameters]
+    rows = [(name(p["name"]), scaled(p["value"], p["standard_uncertainty"] or 0.0), p["unit"]) for p in parameters]
     width = max(len(word) for word, _, _ in rows)
     return [f"{word:<{width}}  {value} {'' if unit == '1' else unit}".rstrip() for word, value, unit in rows]
 

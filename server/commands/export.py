@@ -22,7 +22,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        help="a stored recording's id, a recording's file, or the JSON of diagnose or export",
+        help="a stored recording's or model's id, a recording's file, or the JSON of diagnose or export",
     )
     parser.add_argument(
         "--out",
@@ -56,11 +56,12 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _model(args: argparse.Namespace, out: Path, ending: str) -> int:
-    from calib_core.compensation_code import inputs, write_c, write_python
+    from calib_core.compensation_code import inputs
+    from server.compute import compensation_text
 
     compensation = _compensation(args)
     tree = compensation.to_json()
-    text = {".json": _pretty, ".h": write_c, ".py": write_python}[ending](compensation)
+    text = compensation_text(compensation, ending[1:])
     with whole(out) as file:
         file.write(text.encode())
     if args.json:
@@ -77,12 +78,8 @@ def _model(args: argparse.Namespace, out: Path, ending: str) -> int:
     return 0
 
 
-def _pretty(compensation: "Compensation") -> str:
-    return json.dumps(compensation.to_json(), indent=1, ensure_ascii=False) + "\n"
-
-
 def _compensation(args: argparse.Namespace) -> "Compensation":
-    """From the JSON of a diagnosis or of an earlier export; else the recording is diagnosed here."""
+    """From the JSON of a diagnosis or of an earlier export, or a saved model; else the recording is diagnosed here."""
     from calib_core.compensation import FORMAT, Compensation
 
     if args.source.endswith(".json") and Path(args.source).is_file():
@@ -93,6 +90,11 @@ def _compensation(args: argparse.Namespace) -> "Compensation":
         return Compensation.from_json(tree or {"format": f"not {FORMAT}"})
     from server.diagnosis import of_recording
     from server.store_effects import suspects_of
+    from server.store_models import saved_in
+
+    saved = None if Path(args.source).is_file() else saved_in(args.data, args.source)
+    if saved is not None:
+        return saved
 
     recording, _ = _load(args.source, args.data)
     effects = [name.strip() for name in (args.effects or "").split(",") if name.strip()]

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from calib_core.certificate import TEST_DECIMALS, Field
+from calib_core.certificate import TEST_DECIMALS, Field, scaled
 from calib_core.problem import Problem
 from server import texts
 
@@ -22,6 +22,23 @@ def figure_name(field: Field, lang: str = "en") -> str:
     """The name of a certified number with the test that it is from: `Rate test: Bias error`."""
     test = field.path[0] if field.path[0] in TEST_DECIMALS else None
     return (f"{texts.render(f'certificate.{test}', {}, lang)}: " if test else "") + texts.render(field.text, {}, lang)
+
+
+def compensation_words(compensation: Mapping[str, Any]) -> dict[str, Any]:
+    """What fills the statement of the model that a certificate's axis was compensated by: its terms, and its limits."""
+    terms = [
+        f"{p['name']} = {scaled(p['value'], p['standard_uncertainty'] or 0.0)} {p['unit']}".removesuffix(" 1")
+        for p in compensation["parameters"]
+        if "." in p["name"]
+    ]
+    left = [row["effect"] for row in compensation["left_out"]]
+    return {
+        "axis": compensation["axis"],
+        "name": compensation["name"],
+        "model": compensation["model"],
+        "terms": "; ".join(terms) or "–",
+        "left_out": {"code": "certificate.compensation.left_out", "values": {"effects": left}} if left else "",
+    }
 
 
 def render(content: Mapping[str, Any], kind: str, lang: str = "en") -> bytes:

@@ -40,6 +40,10 @@ def _rows(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             row = {"section": "result", "axis": axis, "name": ".".join(field.path), "unit": _unit(field.path[-1])}
             measured = figures[field.path[0]] if field.measured else {"value": value}
             yield row | {key: measured[key] for key in measured if key in COLUMNS}
+    told = content.get("compensation") or {"axis": "", "parameters": []}
+    for parameter in told["parameters"]:
+        row = {"section": "compensation", "axis": told["axis"]}
+        yield row | {key: parameter[key] for key in ("name", "value", "unit", "standard_uncertainty")}
     for name, state in content["states"].items():
         for test, points in state.get("points", {}).items():
             for point in points:
