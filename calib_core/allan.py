@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calib_core.kalman import F64
 from calib_core.problem import Problem
 
+LEAST = 64  # samples that the noise terms are asked of
 FLICKER = 2.0 * math.log(2.0) / math.pi  # Allan variance of a bias instability B is B² times this
 
 
@@ -75,10 +76,10 @@ def terms(x: F64, rate_hz: float) -> Terms:
 
     Least squares with no negative term, weighted by the fit's own variance 2σ⁴/ν, with ν halved: neighbouring octaves
     overlap, and in white noise all of them together know 1/1.9 of the sum of what each knows. Problem
-    allan.too_short below 64 samples.
+    allan.too_short below LEAST samples.
     """
-    if len(x) < 64:
-        raise Problem("allan.too_short", samples=len(x), needed=64)
+    if len(x) < LEAST:
+        raise Problem("allan.too_short", samples=len(x), needed=LEAST)
     lengths = octaves(len(x))
     measured = deviation(x, rate_hz, lengths)
     variance = measured.deviation**2

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_core import adaptation, integral_fit, kalman, position_test, rate_test, rig_check
+from calib_core import adaptation, allan, integral_fit, kalman, position_test, rate_test, rig_check
 from calib_core.certificate import FIELDS
 from calib_core.gyro_models import PRESETS, GyroModel, Ranges, ranges_from_json
+from calib_core.kalman import F64
 from calib_core.problem import Problem
 from calib_core.recording import Recording, parse_segment
 from calib_core.reference import AxisCalibration
@@ -221,6 +222,7 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
             },
             "delay_s": _delay(fit),
             "noise": {name: fit.noise[name] for name in ("white_dps", "correlation_time_s")},
+            "still": _still(hold / fit.scale_factor, 1.0 / interval_s),
             "chi2_per_row": fit.chi2 / fit.rows,
             "kalman": {
                 "k1": adaptive.gain.k1,
@@ -235,6 +237,21 @@ def _estimate(recording: Recording, axis: str, profile: str, gyro_model: GyroMod
             "warnings": warnings,
         }
     )
+
+
+def _still(rate_dps: F64, rate_hz: float) -> dict[str, Any] | None:
+    """Allan deviation of the hold before the motion, and the angle random walk it shows; None where it has gaps."""
+    if len(rate_dps) < allan.LEAST or not np.isfinite(rate_dps).all():
+        return None
+    measured, walk = allan.deviation(rate_dps, rate_hz), allan.terms(rate_dps, rate_hz).angle_random_walk
+    return {
+        "tau_s": measured.tau_s.tolist(),
+        "deviation_dps": measured.deviation.tolist(),
+        "standard_uncertainty_dps": measured.standard_uncertainty.tolist(),
+        # 60: from deg/s/√Hz to deg/√h, as datasheets print it.
+        "angle_random_walk_deg_per_sqrt_h": 60.0 * walk.value if walk.seen else None,
+        "angle_random_walk_standard_uncertainty": 60.0 * walk.standard_uncertainty,
+    }
 
 
 def motion_of(recording: Recording, axis: str) -> tuple[Recording, Recording]:

@@ -51,6 +51,15 @@ def test_every_certified_number_of_the_contract_is_there_for_both_axes(whole: se
     json.dumps(whole.states, allow_nan=False)
 
 
+def test_the_hold_shows_the_angle_random_walk_of_the_simulated_board(whole: session.Session) -> None:
+    for axis, model in board_truth(SEED, BOARD).items():
+        still = whole.states[f"estimate_{axis}"]["still"]
+        assert still["tau_s"][0] == pytest.approx(0.01)
+        walk = 60.0 * model.noise.white / model.scale_factor / np.sqrt(100.0)  # deg/√h of white noise at 100 Hz
+        found, u = still["angle_random_walk_deg_per_sqrt_h"], still["angle_random_walk_standard_uncertainty"]
+        assert abs(found - walk) < 4 * u < 0.5 * walk
+
+
 def test_the_truth_of_the_simulated_board_lies_inside_four_uncertainties(whole: session.Session) -> None:
     for axis, model in board_truth(SEED, BOARD).items():
         bias, scale_factor = whole.axes[axis]["bias_V"], whole.axes[axis]["scale_factor_V_per_dps"]

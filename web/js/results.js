@@ -45,11 +45,12 @@ const estimateHead = (result) => [t("result.parameter"),
   ...["certified", "expanded", isThesis(result) ? "integral" : "adaptive", "datasheet", "off"].map((key) => ({ n: t(`result.${key}`) }))];
 
 /** What else the estimate state found: the motion's delay, the filter in use and whether it suits, the rig's step. */
-function conditions({ delay_s: delay, noise, kalman, step_check: step }) {
+function conditions({ delay_s: delay, noise, still, kalman, step_check: step }) {
   const ms = (value) => value * 1e3;
   return facts([
     [t("figure.delay"), delay?.value == null ? null : `${withUncertainty(ms(delay.value), ms(delay.standard_uncertainty))} ms`],
     [t("result.noise"), noise ? `${fixed(noise.white_dps, 3)} deg/s` : null],
+    [t("result.random_walk"), still?.angle_random_walk_deg_per_sqrt_h == null ? null : `${withUncertainty(still.angle_random_walk_deg_per_sqrt_h, still.angle_random_walk_standard_uncertainty)} deg/√h`],
     [t("result.gain"), kalman ? `K₁ ${fixed(kalman.k1, 1)} s⁻², K₂ ${fixed(kalman.k2, 2)} s⁻¹` : null],
     [t("result.noise_ratio"), kalman?.noise_ratio == null ? null : fixed(kalman.noise_ratio, 2)],
     [t("result.whiteness"), kalman?.whiteness_p == null ? null : kalman.whiteness_p < 0.001 ? "p < 0.001" : `p = ${fixed(kalman.whiteness_p, 3)}`],

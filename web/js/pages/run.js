@@ -80,6 +80,7 @@ function showRun(main, run, certificate) {
     main.append(card);
     if (kind === "estimate") {
       if (result.budget) card.append(h("details", {}, h("summary", {}, t("result.budget")), budgetTable(result.budget)));
+      if (result.still) still(card, result.still);
       comparison(card, run, axis);
     }
     else test(card, kind, result);
@@ -88,6 +89,21 @@ function showRun(main, run, certificate) {
   if (missing.length && !isOn) {
     main.append(h("section", { class: "panel stack" }, h("p", {}, t("run.missing")), h("div", { class: "row" }, missing.map(({ name }) => h("span", { class: "row" }, stateName(name), repeat(name))))));
   }
+}
+
+/** The gyro at rest: Allan deviation of the hold before the motion, in a drawer that is drawn when it is opened. */
+function still(card, { tau_s: tau, deviation_dps: deviation }) {
+  const place = h("div", {});
+  const drawer = h("details", {}, h("summary", {}, t("run.allan")), h("p", { class: "small muted" }, t("run.allan_says")), place);
+  drawer.addEventListener("toggle", () => {
+    if (!drawer.open || place.firstChild) return;
+    chart(place, {
+      name: t("run.allan"), height: 220,
+      x: { label: t("run.averaging"), unit: "s", log: true }, y: { label: t("run.deviation"), unit: "deg/s", log: true },
+      series: [{ role: "measured", draw: "line" }],
+    }).set([tau, deviation]);
+  });
+  card.append(drawer);
 }
 
 /** Thesis 4.17, 4.18, 5.7 to 5.9: rate and integrated angle against the encoder, with the datasheet's parameters and the estimated ones. */
