@@ -197,7 +197,9 @@ class Space:
                 shapes = self._answered(effect, setting[0] if setting else 0.0)
                 return (("",) * (shapes.shape[1] - 1)) + effect.linear(), Acts.RATE, shapes
             return effect.linear(), Acts.ANGLE, self._late(effect, setting)
-        named = effect.columns(self.covariates, **dict(zip(effect.nonlinear(), setting, strict=True)))
+        # Nothing is remembered from one look to the next: each begins settled, as the recording does.
+        begun = replace(self.covariates, memory={})
+        named = effect.columns(begun, **dict(zip(effect.nonlinear(), setting, strict=True)))
         return tuple(named), effect.acts, np.column_stack([*named.values()])
 
     def over_rows(self, acts: Acts, shapes: F64 | Operator) -> F64:

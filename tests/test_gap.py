@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from shared import shared
 
-from calib_core import recording
+from calib_core import gap, recording
+from calib_core.effects import library
 from calib_core.gap import Diagnosis, diagnose, named
 from calib_core.gap_report import to_json
 from calib_core.recording import Recording
@@ -83,6 +84,12 @@ def test_an_effect_in_no_library_is_flagged_and_gets_no_name() -> None:
 def test_two_effects_are_both_found() -> None:
     diagnosis = diagnose(made(9, {"bias_temperature": 1.0, "scale_factor_asymmetry": 1.0}), "x")
     assert {"bias_temperature", "scale_factor_asymmetry"} <= told(diagnosis)
+
+
+def test_a_second_look_at_a_time_constant_begins_settled_too() -> None:
+    space = gap.prepare(made(7, {}), "x")
+    looks = [space.term(library()["thermal_lag"], (40.0,)).columns for _ in range(2)]
+    np.testing.assert_array_equal(*looks)
 
 
 def test_parameters_are_recovered_within_their_uncertainty() -> None:
