@@ -54,6 +54,7 @@ LET_GO_S = 0.5  # torque off is said again until it is seen, this long
 KEEP = 3000  # readings kept for a reader who is late: half a minute
 RESENDS = 5
 URGENT = -10
+SWITCH_S = 1e-4  # a thread that computes gives the interpreter up this soon: a reply has 3 ms to be stamped
 FIRST_DPS = 10.0  # speed while a servo takes hold of where it stands
 JUMP_STEPS = 6  # a reading may be this far from where the last and the top speed allow
 JUMPS = 3  # as many wild readings in a row are the truth
@@ -226,6 +227,8 @@ class DynamixelTable:
         if sys.platform == "linux":
             with suppress(PermissionError):  # a reading that waits for the host cannot be stamped
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), URGENT)
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
         try:
             while not self._closing:
                 with self._changed:
@@ -237,6 +240,7 @@ class DynamixelTable:
             if not self._loose:
                 self._let_go()
             self.bus.close()
+            sys.setswitchinterval(usual)
             with self._changed:
                 self._opened, self._halted = self._opens, self._halts
                 self._changed.notify_all()
