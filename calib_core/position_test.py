@@ -82,7 +82,8 @@ def readings(recording: Recording, axis: str, bias: float, scale_factor: float, 
         inside = recording.where(lambda name: name.startswith(f"position_{axis}/"))
         rate = filtered(recording.time_s, np.where(inside, rate, 0.0))
     rest = rests(strokes)
-    begin = rest.from_s + SETTLED * (rest.leave_s - rest.from_s)
+    with np.errstate(invalid="ignore"):  # infinite where there was no reading
+        begin = rest.from_s + SETTLED * (rest.leave_s - rest.from_s)
     area = integral_at(recording.time_s + gyro.delay_s, rate, np.concatenate([begin, rest.until_s]))
     measured = area[len(strokes) :] - area[: len(strokes)]
     reference = rest.after_deg - rest.before_deg
@@ -126,7 +127,8 @@ def _keep(strokes: Strokes, angle: F64, rest: Rests, warnings: list[dict[str, An
     """Which moves have a reading; says of the others why not, and of those kept what is odd about them."""
     kept = []
     for i, segment in enumerate(strokes.segments):
-        before_s, after_s = float(rest.leave_s[i] - rest.from_s[i]), float(rest.until_s[i] - rest.arrive_s[i])
+        before_s = float(rest.leave_s[i]) - float(rest.from_s[i])
+        after_s = float(rest.until_s[i]) - float(rest.arrive_s[i])
         values = {"before_s": before_s, "after_s": after_s, "least_s": LEAST_REST_S}
         if unusable := strokes.unusable(i):
             warnings.append(unusable)
