@@ -47,7 +47,8 @@ def test_the_example_in_the_help_is_understood_by_its_command(name: str, capsys:
     module = cli._module(name)
     parser = cli.Parser(prog=name)
     module.add(parser)
-    parser.parse_args(shlex.split(module.EXAMPLE)[2:])
+    for line in module.EXAMPLE.splitlines():
+        parser.parse_args(shlex.split(line)[2:])
     assert capsys.readouterr().err == ""
 
 

@@ -1,11 +1,16 @@
 """Bodies as they are asked for and given, with their bounds; FastAPI makes OpenAPI of them."""
 
+import warnings
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from calib_core.problem import Problem
 from server.store_db import ID_PATTERN, checked_id
+
+# FastAPI silences this where it builds its fields; ours are built when first asked for.
+warnings.filterwarnings("ignore", category=UnsupportedFieldAttributeWarning)
 
 Axis = Literal["x", "z"]
 StateName = Literal["estimate_x", "rate_x", "position_x", "estimate_z", "rate_z", "position_z"]
