@@ -17,10 +17,11 @@ from calib_core import covariates, gap_saturation
 from calib_core.effects import Effect, library
 from calib_core.gap_checks import Check, checks
 from calib_core.gap_error import Explanation
-from calib_core.gap_search import Search, Suspicion
+from calib_core.gap_search import SHARE, Search, Suspicion
 from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_unknown import CERTAIN, Structure, structures
+from calib_core.gap_wander import Walk, wandering
 from calib_core.integral_fit import Design
 from calib_core.problem import Problem
 from calib_core.recording import Recording
@@ -28,7 +29,8 @@ from calib_core.recording import Recording
 F64 = NDArray[np.float64]
 
 FORM = 0.03
-"""Structure that explains less than this share of what has a name is the name's form, which is never quite right."""
+"""Structure that explains less than this share of what has a name is the name's form, which is never quite right, or
+the error of a reference rate."""
 AGREED = 2.0
 """Of χ² on data not seen, what an effect must take away."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
@@ -50,6 +52,9 @@ class Diagnosis:
     clip: gap_saturation.Clip | None = None
     clip_gain: float = 0.0
     hum: Hum | None = None
+    walk: Walk | None = None
+    coarse: float | None = None
+    """The converter's step, where it is too coarse for the noise."""
     unknown: Structure | None = None
     before: Explanation | None = None
     after: Explanation | None = None
@@ -76,11 +81,20 @@ def diagnose(
     space, search = _search(recording, axis, pool, effects, rng)
     if "saturation" in pool:
         space, search = _clipped(answer, recording, space, search, pool, effects, rng)
-    search.run()
-    search.merge()
-    search.confirm()
-    _agree(search)
-    _structure(answer, search)
+    _sought(search)
+    coarse = next((c for c in answer.checks if c.code == "check.record.adc_coarse"), None)
+    if "adc_quantization" in pool and coarse is not None:
+        answer.coarse = float(str(coarse.values["step"]))
+    elif "bias_random_walk" in pool:
+        answer.walk = wandering(search)
+        if answer.walk is not None:
+            # Beside a bias that wanders a step or a drift must be plainer, and the rest may be plainer to see.
+            search = Search(search.space, search.suspects, rng, search.chosen[: search.given], columns=search.columns)
+            _sought(search)
+    if answer.coarse is not None:
+        _beyond(search, answer.coarse)
+    else:
+        _structure(answer, search)
     if "mains_hum" in pool:
         line = find_hum(search.space.design.averages.samples, moving=search.space.design.moves)
         answer.hum = line if line is not None and line.found else None
@@ -89,7 +103,9 @@ def diagnose(
     answer.rivals = search.rivals()[search.given :]
     answer.before, answer.after = Explanation(search.space, answer.asked), Explanation(search.space, named(search))
     answer.candidates = _candidates(search, pool, answer)
-    found = bool(named(search)[len(effects) :]) or answer.hum is not None or answer.clip is not None
+    found = bool(named(search)[len(effects) :]) or any(
+        x is not None for x in (answer.hum, answer.clip, answer.walk, answer.coarse)
+    )
     tied = any(len(r) > 1 for r in answer.rivals)
     if answer.unknown is not None:
         answer.verdict = "unknown"
@@ -166,6 +182,14 @@ def _clipped(
     return kept, without
 
 
+def _sought(search: Search) -> None:
+    """Adds what is missing, and takes away what does not hold."""
+    search.run()
+    search.merge()
+    search.confirm()
+    _agree(search)
+
+
 def _agree(search: Search) -> None:
     """Drops what does not lower the error on data not seen, however sure it looks where it was fitted."""
     while len(search.chosen) > search.given:
@@ -180,11 +204,23 @@ def _agree(search: Search) -> None:
         del search.chosen[search.given + worst], search.findings[worst]
 
 
+def _beyond(search: Search, step: float) -> None:
+    """Drops what is smaller than a coarse converter's rounding, which goes with the rate and is no noise."""
+    explanation = Explanation(search.space, search.chosen)
+    values, at = explanation.solution[0], len(search.space.prior)
+    for k, term in reversed(list(enumerate(search.chosen))):
+        begin = at + sum(t.columns.shape[1] for t in search.chosen[:k])
+        size = term.columns @ values[begin : begin + term.columns.shape[1]]
+        if k >= search.given and float(np.std(size)) < step / np.sqrt(12.0):
+            del search.chosen[k], search.findings[k - search.given]
+
+
 def _structure(answer: Diagnosis, search: Search) -> None:
     """Flags what no library effect explains; names that do not pass beside it are dropped."""
     found = structures(search.space, search.chosen)
     explained = search.chi2([]) - search.chi2(search.chosen)
-    if not found or found[0].z < CERTAIN or found[0].gain < FORM * explained:
+    form = SHARE if search.space.design.reference == "encoder" else FORM
+    if not found or found[0].z < CERTAIN or found[0].gain < form * explained:
         return
     answer.unknown = found[0]
     names = {t.name for t in search.chosen[search.given :]}
@@ -220,12 +256,22 @@ def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis
             row["two_delta_lnL"] = answer.clip_gain if answer.clip else 0.0
         elif name == "mains_hum":
             row["two_delta_lnL"] = answer.hum.two_delta_lnL if answer.hum else 0.0
+        elif name == "bias_random_walk":
+            row["two_delta_lnL"] = answer.walk.two_delta_lnL if answer.walk else 0.0
+        elif name == "adc_quantization":
+            row["two_delta_lnL"] = on_grid(answer) if answer.coarse else 0.0
         elif name in tested:
             row["two_delta_lnL"], row["p"] = tested[name].gain, p_value(tested[name].z)
         elif name not in BY_ITSELF and name not in chosen:
             row["status"] = "not_excited"
         rows.append(row)
     return rows
+
+
+def on_grid(answer: Diagnosis) -> float:
+    """2ΔlnL of every sample's lying within a fifth of a step of the converter's grid, against lying anywhere."""
+    samples = int(np.isfinite(answer.recording.gyro(answer.axis).values).sum())
+    return 2.0 * samples * float(np.log(2.5))
 
 
 def p_value(z: float) -> float:

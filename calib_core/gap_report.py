@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from calib_core.gap import Diagnosis, p_value
+from calib_core.gap import Diagnosis, on_grid, p_value
 from calib_core.gap_error import Explanation
+from calib_core.gap_search import equivalent_z
 from calib_core.integral_fit import SUFFIX
 
 FAILING = 4.0
@@ -102,6 +103,14 @@ def _missing(d: Diagnosis) -> list[dict[str, Any]]:
         pitch = _parameter("mains_hum.f", hum.frequency_hz, "Hz", hum.frequency_uncertainty_hz)
         line = {"effect": "mains_hum", "two_delta_lnL": hum.two_delta_lnL, "p": hum.p, "parameters": [size, pitch]}
         found.append(line)
+    unit = d.recording.gyro(d.axis).unit
+    if d.walk is not None:
+        size = _parameter("bias_random_walk.k", d.walk.k, f"{unit}/sqrt(s)", d.walk.k * d.walk.relative_uncertainty)
+        z = float(equivalent_z(d.walk.two_delta_lnL, 2))
+        found.append(_finding("bias_random_walk", d.walk.two_delta_lnL, z, [size]))
+    if d.coarse is not None:
+        evidence, step = on_grid(d), _parameter("adc_quantization.step", d.coarse, unit, None)
+        found.append(_finding("adc_quantization", evidence, float(np.sqrt(evidence)), [step]))
     every = {p["name"]: p for p in parameters(d.after)}
     for finding in d.search.findings:
         name = finding.chosen.term.name

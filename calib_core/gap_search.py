@@ -148,6 +148,10 @@ class Search:
         gram, free = self._free(terms)
         return gram.chi2(free)
 
+    def deviance(self, terms: Sequence[Term]) -> float:
+        """-2lnL of the record under base and ``terms`` and the noise of now, up to a constant."""
+        return self.chi2(terms) + self.space.whitener.log_determinant
+
     def held_out(self, terms: Sequence[Term]) -> float:
         """χ² of what base and ``terms`` leave of each fold, fitted to the others."""
         gram, free = self._free(terms, folds=True)

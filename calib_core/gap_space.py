@@ -97,9 +97,14 @@ class Space:
         self.rows, self._condensing = condense(design)
         fine = design.output(0.0)
         self._output, self._rate = self._condensing @ fine, self._condensing @ design.rate
-        self.rough_noise = first_guess(design.rows, fine)
-        third = np.abs(np.diff(design.averages.samples.output, 3))
-        self._least_noise = 0.9 * max(float(np.median(third)) / (0.6745 * math.sqrt(20.0)), 1e-12)
+        output = design.averages.samples.output
+        scatter = float(np.median(np.abs(np.diff(output, 3)))) / (0.6745 * math.sqrt(20.0))
+        if scatter == 0.0:
+            # A coarse converter rounds the noise away; what it does instead is known no better than by its step.
+            step = np.abs(np.diff(output))
+            scatter = float(np.median(step[step > 0.0])) / math.sqrt(12.0)
+        self.rough_noise = max(first_guess(design.rows, fine), 0.1 * scatter)
+        self._least_noise = 0.9 * scatter
         self.folds = Folds.of(self.rows.time_s)
         one = np.ones((len(self.rows), 1))
         self.values = self.values[: 2 if design.moves else 1]
@@ -161,6 +166,12 @@ class Space:
         self.whitener = Whitener(self.rows, self.scale_factor, noise.noise)
         self._bank: Bank | None = None
         self._whitened: dict[int, tuple[Term, F64]] = {}
+
+    def extend(self, columns: F64, prior: F64) -> None:
+        """Puts columns (n, p) into the base, of whose coefficients ``prior`` (p,) is known: one over a deviation."""
+        self.base = np.column_stack([self.base, columns])
+        self.prior = np.append(self.prior, prior)
+        self.use_noise(self.noise)
 
     def enlist(self, terms: Sequence[Term]) -> None:
         """These will be asked for together, again and again: their Gram matrix is made once for each noise."""

@@ -105,6 +105,15 @@ def test_parameters_are_recovered_within_their_uncertainty() -> None:
     assert abs(abs(cubic["value"]) - 1.2e-6) < 5.0 * cubic["standard_uncertainty"]
 
 
+@pytest.mark.parametrize("effect", ["bias_random_walk", "adc_quantization"])
+def test_what_is_no_shape_is_named_by_its_own_evidence(effect: str) -> None:
+    answer = to_json(diagnose(made(31, {effect: 1.0}, plan="second"), "x"))
+    assert [m["effect"] for m in answer["missing"]] == [effect]
+    size = answer["missing"][0]["parameters"][0]
+    truth = {"bias_random_walk": 3e-4, "adc_quantization": 9.77e-3}[effect]
+    assert size["value"] == pytest.approx(truth, rel=0.01 if effect == "adc_quantization" else 0.6)
+
+
 def test_asked_effects_stand_in_the_model_and_are_not_missing() -> None:
     answer = to_json(diagnose(made(11, {"scale_factor_cubic": 0.6}), "x", effects=["scale_factor_cubic"]))
     assert answer["model"]["effects"] == ["scale_factor_cubic"]

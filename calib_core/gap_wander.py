@@ -1,0 +1,95 @@
+"""A bias that wanders (rate random walk, IEEE Std 952): its evidence, and a model that lets it wander.
+
+A wandering bias looks like a step here and a drift there, or like noise correlated over as long as noise may be. So
+where either was found, a walk in place of all slow shapes is weighed against them, by likelihood. A random walk about
+its own mean is a sum of cosines over the record (its Karhunen-Loève series) with independent coefficients of deviation
+k·sqrt(2T)/(πj); as columns with that much known beforehand they may stand in any model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_core.effects.base import Acts
+from calib_core.gap_search import RIVAL, Search
+from calib_core.gap_space import Space, Term
+from calib_core.gap_unknown import Unknown
+from calib_core.noise_fit import MAX_CORRELATION_S
+
+F64 = NDArray[np.float64]
+
+SLOW = ("bias_drift", "bias_step", "warm_up", "thermal_lag", "bias_temperature", "supply_sensitivity", "unknown")
+"""Shapes that a walk may look like."""
+NEAR_LIMIT = 0.5
+"""Of the longest correlation that noise may have."""
+FASTEST_S, MOST = 4.0, 60
+"""The series ends at half waves of this length: what is faster is noise."""
+EVIDENCE = 16.0
+"""2ΔlnL over noise that does not wander."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """The wandering of a bias."""
+
+    k: float
+    """Output unit per root second."""
+    relative_uncertainty: float
+    two_delta_lnL: float
+    """Over noise that does not wander, beside the same model."""
+
+
+def wandering(search: Search) -> Walk | None:
+    """The walk that explains the record better than the slow shapes of ``search`` do, the space then having it in its
+    base; or None, and nothing has changed."""
+    space, given = search.space, search.given
+    kept = [t for k, t in enumerate(search.chosen) if k < given or t.name not in SLOW]
+    noise = space.noise.noise
+    at_limit = noise.ar1 > 0.0 and noise.correlation_time_s > NEAR_LIMIT * MAX_CORRELATION_S
+    if len(kept) == len(search.chosen) and not at_limit:
+        return None
+    was, now = space.noise, search.deviance(search.chosen)
+    space.refit_noise(kept)
+    plain = search.deviance(kept)
+    waves, deviations = _series(space)
+    space.refit_noise([*kept, waves])
+    size = np.linspace(math.log(1e-3), math.log(1e3), 61) + math.log(noise.white * 0.1)
+    deviance = np.array([_deviance(search, kept, waves, math.exp(u) * deviations) for u in size])
+    best = int(np.argmin(deviance))
+    if deviance[best] > min(now - RIVAL, plain - EVIDENCE) or not 0 < best < len(size) - 1:
+        space.use_noise(was)
+        return None
+    h = float(size[1] - size[0])
+    bend = float(deviance[best - 1] - 2.0 * deviance[best] + deviance[best + 1]) / h**2
+    k = math.exp(size[best])
+    space.extend(waves.columns, 1.0 / (k * deviations))
+    return Walk(k, math.sqrt(2.0 / bend) if bend > 0.0 else math.nan, float(plain - deviance[best]))
+
+
+def _series(space: Space) -> tuple[Term, F64]:
+    """The cosines, and the deviations of their coefficients for a walk of k = 1."""
+    time = space.covariates.time_s
+    end = float(time[-1])
+    j = np.arange(1, int(np.clip(end / FASTEST_S, 2, MOST)) + 1)
+    columns = np.column_stack([space.over_rows(Acts.OUTPUT, np.cos(np.pi * k * time / end)[:, None]) for k in j])
+    names = tuple(f"c{k}" for k in j)
+    return Term(Unknown, (), names, columns, np.zeros(len(j))), np.asarray(math.sqrt(2.0 * end) / (math.pi * j), float)
+
+
+def _deviance(search: Search, kept: list[Term], waves: Term, deviations: F64) -> float:
+    """-2lnL with the walk's coefficients integrated out, up to the same constant as ``search.deviance``."""
+    gram = search.space.gram([*kept, waves])
+    free = [k for k, name in enumerate((n for t in kept for n in t.names), 1 + gram.base) if name]
+    places = list(range(len(gram.scale) - len(deviations), len(gram.scale)))
+    projected = gram.without(free)
+    size = gram.scale[places] * deviations
+    block = projected[np.ix_(places, places)] * np.outer(size, size) + np.eye(len(places))
+    score = projected[places, 0] * size * gram.scale[0]
+    factor = np.linalg.cholesky(block)
+    inside = np.linalg.solve(factor, score)
+    rest = projected[0, 0] * gram.scale[0] ** 2 - float(inside @ inside)
+    return float(rest) + 2.0 * float(np.log(np.diag(factor)).sum()) + search.space.whitener.log_determinant
