@@ -2,7 +2,7 @@
 
 Sensors answer late and know nothing of it, so not everything can be undone sample by sample: the rate that comes out
 belongs to a moment ``delay_s`` before the sample. What belongs to the encoder, or cannot be foretold, is left out and
-named. ``compensation_code`` writes the same arithmetic as C and as Python.
+named. ``compensation_c`` and ``compensation_python`` write the same arithmetic.
 """
 
 import json

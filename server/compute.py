@@ -198,7 +198,8 @@ def export_model(data: Path, model: str, form: str) -> str:
 
 
 def compensation_text(compensation: "Compensation", form: str) -> str:
-    from calib_core.compensation_code import write_c, write_python
+    from calib_core.compensation_c import write_c
+    from calib_core.compensation_python import write_python
 
     if form == "json":
         return json.dumps(compensation.to_json(), indent=1, ensure_ascii=False) + "\n"

@@ -15,7 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib_core.compensation import Compensation
-from calib_core.compensation_code import INPUTS, REASONS, write_c, write_python
+from calib_core.compensation_body import INPUTS, REASONS
+from calib_core.compensation_c import write_c
+from calib_core.compensation_python import write_python
 from calib_core.effects import Covariates, Effect, library
 from calib_core.formula import effect_of, to_json
 from calib_core.model import REFERENCE, Model, Truth

@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _model(args: argparse.Namespace, out: Path, ending: str) -> int:
-    from calib_core.compensation_code import inputs
+    from calib_core.compensation_body import inputs
     from server.compute import compensation_text
 
     compensation = _compensation(args)

@@ -1,13 +1,12 @@
-"""Compensation as source text: a C99 header and a Python module, both translated from one body.
+"""What compensates a gyro's output, as one function body that every language is written from.
 
 The body is written below in a small piece of Python (assignments, if, for, break, return) over formulas of the effects'
-parameters; each dialect only says how it writes them. What is translated is what ``Compensation.rate`` computes.
+parameters. What it computes is what ``Compensation.rate`` computes; ``compensation_writer`` turns it into a language.
 """
 
 import ast
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from calib_core.compensation import CLOSE_DPS, FASTEST_DPS, OWN_WAY, SWAYING_DPS, TURNS, Compensation
@@ -39,117 +38,12 @@ REASONS = {
 """Why effects are left out, by the words of ``Compensation.left_out``."""
 
 
-@dataclass(frozen=True)
-class Dialect:
-    """How a language writes expressions."""
-
-    number: str
-    either: str
-    functions: Mapping[str, str]
-    and_: str
-    or_: str
-    field: str
-
-
-C = Dialect(
-    number="GYRO_R({})",
-    either="{} ? {} : {}",
-    functions={"abs": "fabs", "min": "fmin", "max": "fmax"},
-    and_="&&",
-    or_="||",
-    field="state->",
-)
-PYTHON = Dialect(
-    number="{}",
-    either="{1} if {0} else {2}",
-    functions={name: f"math.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "radians")},
-    and_="and",
-    or_="or",
-    field="state.",
-)
-COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
-OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
-
-
-def write_c(compensation: Compensation) -> str:
-    """A C99 header: static inline functions, no allocation, double or whatever GYRO_REAL is defined as."""
-    body = _Body(compensation)
-    prefix = f"gyro_{compensation.axis}"
-    upper = prefix.upper()
-    write = _Writer(C, {name: f"{upper}_{name}" for name in body.constants})
-    written = {name: f"GYRO_R({value!r})" for name, (value, _) in body.constants.items()}
-    # Single precision cannot come closer than its own rounding.
-    written |= {"CLOSE_DPS": f"GYRO_R(sizeof(GYRO_REAL) < sizeof(double) ? 1e-4 : {CLOSE_DPS!r})"}
-    constants = [
-        f"#define {upper}_{name} {written[name]} /* {_plain(unit)} */" for name, (_, unit) in body.constants.items()
-    ]
-    state = f"{prefix}_state *state" if body.memory else ""
-    arguments = ", ".join(filter(None, [state, *(f"GYRO_REAL {name}" for name in body.arguments)]))
-    names = sorted(body.assigned)
-    lines = [f"/* {line} */" if line else "" for line in _head(compensation, body, f"{prefix}_rate_dps")]
-    memory = [f"    GYRO_REAL {name};" for name in body.memory]
-    reset = [f"    state->{name} = GYRO_R(0);" for name in body.memory]
-    structure = [
-        "/* What it remembers from sample to sample; reset before the first. */\ntypedef struct {\n"
-        + "\n".join(memory),
-        f"}} {prefix}_state;\n",
-        f"static inline void {prefix}_reset({prefix}_state *state)\n{{\n" + "\n".join(reset) + "\n}\n",
-    ]
-    return "\n".join(
-        [
-            *lines,
-            f"#ifndef {upper}_COMPENSATION_H\n#define {upper}_COMPENSATION_H\n",
-            "#include <math.h>\n#include <tgmath.h>\n",
-            "#ifndef GYRO_REAL\n#define GYRO_REAL double /* or float */\n#endif",
-            "#ifndef GYRO_R\n#define GYRO_R(x) ((GYRO_REAL)(x))\n#endif\n",
-            *constants,
-            "",
-            *(structure if body.memory else []),
-            f"static inline GYRO_REAL {prefix}_rate_dps({arguments})\n{{",
-            *([f"    GYRO_REAL {', '.join(names)};"] if names else []),
-            *write.block(body.tree, 1),
-            "}\n",
-            *_limits_c(compensation, upper, prefix, body.output),
-            f"#endif /* {upper}_COMPENSATION_H */\n",
-        ]
-    )
-
-
-def write_python(compensation: Compensation) -> str:
-    """A Python module without imports beyond ``math``: ``rate_dps(…)``, and ``State`` where something is remembered."""
-    body = _Body(compensation)
-    write = _Writer(PYTHON, {name: name for name in body.constants})
-    arguments = ", ".join([*(["state"] if body.memory else []), *body.arguments])
-    head = "\n".join(_head(compensation, body, "rate_dps"))
-    return "\n".join(
-        [
-            f'"""{head}\n"""\n',
-            "import math\n",
-            *(f"{name} = {float(value)!r}  # {_plain(unit)}" for name, (value, unit) in body.constants.items()),
-            *(
-                [
-                    "\n\nclass State:",
-                    '    """What it remembers from sample to sample; make a new one before the first."""\n',
-                    "    def __init__(self):",
-                    *(f"        self.{name} = 0.0" for name in body.memory),
-                ]
-                if body.memory
-                else []
-            ),
-            f"\n\ndef rate_dps({arguments}):",
-            *write.block(body.tree, 1),
-            *_limits_python(compensation, body.output),
-            "",
-        ]
-    )
-
-
 def inputs(compensation: Compensation) -> tuple[str, ...]:
     """The arguments of the written function, the output first."""
-    return _Body(compensation).arguments
+    return Body(compensation).arguments
 
 
-def _head(compensation: Compensation, body: "_Body", function: str) -> list[str]:
+def head(compensation: Compensation, body: "Body", function: str) -> list[str]:
     unit = compensation.model.unit
     effects = ", ".join(compensation.undone) or "none"
     late = compensation.delay_s
@@ -169,7 +63,7 @@ def _head(compensation: Compensation, body: "_Body", function: str) -> list[str]
         lines.append("Not a number where the model has no answer for such an output.")
     lines += [f"Not undone: {name} ({REASONS[reason]})." for name, reason in compensation.left_out]
     lines += ["", *(_row(row) for row in compensation.rows)]
-    return [_plain(line) for line in lines]
+    return [plain(line) for line in lines]
 
 
 def _row(row: Mapping[str, Any]) -> str:
@@ -179,37 +73,19 @@ def _row(row: Mapping[str, Any]) -> str:
     )
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """Text that ends no comment and no docstring, in ASCII."""
     flat = re.sub(r"[^\x20-\x7e]", "?", text.replace("°", "deg "))
     return flat.replace("*/", "* /").replace("/*", "/ *").replace('"""', "'''").replace("\\", "/")
 
 
-def _limits_c(compensation: Compensation, upper: str, prefix: str, output: str) -> list[str]:
-    tests = [f"{output} {sign} {upper}_{name}" for name, sign, _ in _limits(compensation)]
-    if not tests:
-        return []
-    return [
-        f"/* Whether the output is at a limit: then the rate is at least what is told. */\n"
-        f"static inline int {prefix}_saturated(GYRO_REAL {output})\n{{\n    return {' || '.join(tests)};\n}}\n"
-    ]
-
-
-def _limits_python(compensation: Compensation, output: str) -> list[str]:
-    tests = [f"{output} {sign} {name}" for name, sign, _ in _limits(compensation)]
-    if not tests:
-        return []
-    says = "Whether the output is at a limit: then the rate is at least what is told."
-    return [f'\n\ndef saturated({output}):\n    """{says}"""\n    return {" or ".join(tests)}']
-
-
-def _limits(compensation: Compensation) -> list[tuple[str, str, float]]:
+def limits(compensation: Compensation) -> list[tuple[str, str, float]]:
     rows = {row["name"]: float(row["value"]) for row in compensation.rows}
     both = (("V_lo", "<="), ("V_hi", ">="))
     return [(f"SATURATION_{n.upper()}", s, rows[f"saturation.{n}"]) for n, s in both if f"saturation.{n}" in rows]
 
 
-class _Body:
+class Body:
     """The function's body as a tree, with its constants, arguments, memory and local names."""
 
     def __init__(self, compensation: Compensation) -> None:
@@ -224,7 +100,7 @@ class _Body:
         self.lagged: list[str] = []
         terms = [term for e in compensation.effects if e.name not in OWN_WAY for term in self.terms(e)]
         lines = self.lines(terms)
-        self.constants |= {name: (value, unit) for name, _, value in _limits(compensation)}
+        self.constants |= {name: (value, unit) for name, _, value in limits(compensation)}
         self.tree = ast.parse("\n".join(lines)).body
         names = [n for node in self.tree for n in ast.walk(node) if isinstance(n, ast.Name)]
         used = {n.id for n in names}
@@ -359,7 +235,7 @@ def _names(text: str) -> set[str]:
 class _Named(ast.NodeTransformer):
     """Puts constants in place of settings and of what the reference says, and memory in place of ``lagged``."""
 
-    def __init__(self, settings: Mapping[str, str], body: _Body) -> None:
+    def __init__(self, settings: Mapping[str, str], body: Body) -> None:
         self.settings, self.body = settings, body
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
@@ -383,115 +259,3 @@ class _Named(ast.NodeTransformer):
             f"state.{slow}_input = {value}",
         ]
         return ast.Attribute(ast.Name("state", ast.Load()), slow, ast.Load())
-
-
-ADDITION, PRODUCT, SIGN, POWER, ATOM = range(1, 6)
-
-
-class _Writer:
-    """Writes a checked tree in a dialect, with as few brackets as its precedence needs."""
-
-    def __init__(self, dialect: Dialect, constants: Mapping[str, str]) -> None:
-        self.dialect, self.constants = dialect, constants
-        self.c = dialect is C
-        self.zero = dialect.number.format("0")
-
-    def block(self, body: Sequence[ast.stmt], depth: int) -> list[str]:
-        return [line for statement in body for line in self.statement(statement, depth)]
-
-    def statement(self, node: ast.stmt, depth: int) -> list[str]:
-        pad, end = "    " * depth, ";" if self.c else ""
-        match node:
-            case ast.Assign(targets=[target], value=value):
-                return [f"{pad}{self.of(target)} = {self.of(value)}{end}"]
-            case ast.Return(value=ast.expr() as value):
-                return [f"{pad}return {self.of(value)}{end}"]
-            case ast.Break():
-                return [f"{pad}break{end}"]
-            case ast.If(test=test, body=body):
-                head = f"if ({self.test(test)}) {{" if self.c else f"if {self.test(test)}:"
-            case ast.For(target=ast.Name(id=name), iter=ast.Call(args=[ast.Constant(value=int(times))]), body=body):
-                written = f"(int {name} = 0; {name} < {times}; {name}++) {{" if self.c else f"_ in range({times}):"
-                head = f"for {written}"
-            case _:
-                raise AssertionError(ast.dump(node))
-        return [f"{pad}{head}", *self.block(body, depth + 1), *([f"{pad}}}"] if self.c else [])]
-
-    def of(self, node: ast.expr, above: int = 0) -> str:
-        """The expression, in brackets where it binds less than ``above`` asks."""
-        text, binds = self._of(node)
-        return f"({text})" if binds < above else text
-
-    def _of(self, node: ast.expr) -> tuple[str, int]:
-        d = self.dialect
-        match node:
-            case ast.Constant(value=int() | float() as value):
-                return d.number.format(f"{value:d}" if isinstance(value, int) else repr(value)), ATOM
-            case ast.Name(id="pi"):
-                return d.number.format("3.141592653589793"), ATOM
-            case ast.Name(id="nan"):
-                return "NAN" if self.c else "math.nan", ATOM
-            case ast.Name(id=name):
-                return self.constants.get(name, name), ATOM
-            case ast.Attribute(attr=name):
-                return f"{d.field}{name}", ATOM
-            case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return f"-{self.of(operand, SIGN)}", SIGN
-            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                return self._of(operand)
-            case ast.BinOp(left=left, op=ast.Pow(), right=right):
-                return self.power(left, right)
-            case ast.BinOp(left=left, op=op, right=right):
-                binds = ADDITION if isinstance(op, ast.Add | ast.Sub) else PRODUCT
-                return f"{self.of(left, binds)} {OPERATORS[type(op)]} {self.of(right, binds + 1)}", binds
-            case ast.Compare() | ast.BoolOp() | ast.UnaryOp():
-                return d.either.format(self.test(node), d.number.format("1"), self.zero), 0
-            case ast.Call(func=ast.Name(id="where"), args=[condition, yes, no]):
-                return d.either.format(self.test(condition), self.of(yes, 1), self.of(no, 1)), 0
-            case ast.Call(func=ast.Name(id=name), args=args):
-                return self.call(name, args)
-        raise AssertionError(ast.dump(node))
-
-    def test(self, node: ast.expr) -> str:
-        """A condition."""
-        d = self.dialect
-        match node:
-            case ast.Compare(left=left, ops=ops, comparators=others):
-                sides = [self.of(side, ADDITION) for side in (left, *others)]
-                pairs = zip(sides[:-1], ops, sides[1:], strict=True)
-                return f" {d.and_} ".join(f"{a} {COMPARISONS[type(op)]} {b}" for a, op, b in pairs)
-            case ast.BoolOp(op=op, values=values):
-                word = d.and_ if isinstance(op, ast.And) else d.or_
-                return f" {word} ".join(f"({self.test(value)})" for value in values)
-            case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return f"{self.of(operand, ADDITION)} == {self.zero}"
-        return f"{self.of(node, ADDITION)} != {self.zero}"
-
-    def power(self, left: ast.expr, right: ast.expr) -> tuple[str, int]:
-        if not self.c:
-            return f"{self.of(left, ATOM)}**{self.of(right, SIGN)}", POWER
-        if isinstance(left, ast.Name) and isinstance(right, ast.Constant) and right.value in (2, 3):
-            return " * ".join([self.of(left)] * (2 if right.value == 2 else 3)), PRODUCT
-        return f"pow({self.of(left)}, {self.of(right)})", ATOM
-
-    def call(self, name: str, args: Sequence[ast.expr]) -> tuple[str, int]:
-        if name == "sign":
-            x = self.of(args[0], ADDITION)
-            one = self.dialect.number.format("1")
-            up, down = (self.dialect.either.format(f"{x} {side} {self.zero}", one, self.zero) for side in "><")
-            return f"({up}) - ({down})", ADDITION
-        texts = [self.of(arg) for arg in args]
-        if name == "clip":
-            return self.nested("min", [self.nested("max", texts[:2]), texts[2]]), ATOM
-        if name in ("min", "max"):
-            return self.nested(name, texts), ATOM
-        if name == "radians" and self.c:
-            return f"{self.of(args[0], PRODUCT)} * GYRO_R(0.017453292519943295)", PRODUCT
-        return f"{self.dialect.functions.get(name, name)}({', '.join(texts)})", ATOM
-
-    def nested(self, name: str, texts: Sequence[str]) -> str:
-        """C's take two."""
-        *first, last = texts
-        if self.c and len(first) > 1:
-            first = [self.nested(name, first)]
-        return f"{self.dialect.functions.get(name, name)}({', '.join([*first, last])})"
