@@ -1,6 +1,6 @@
 """The gyro's clock runs faster or slower than the encoder's."""
 
-from calib_core.effects.base import F64, Acts, Covariates, Effect, Param, Stage
+from calib_core.effects.base import F64, Acts, Chain, Covariates, Effect, Param, Stage
 
 
 class ClockSkew(Effect):
@@ -20,3 +20,8 @@ class ClockSkew(Effect):
     @classmethod
     def columns(cls, c: Covariates, **_: float) -> dict[str, F64]:
         return {"skew": -c.time_s * c.acceleration_dps2}
+
+    def apply(self, chain: Chain) -> None:
+        """To first order, which is enough where the clocks part by milliseconds."""
+        skewed = self.values["skew"] * self.columns(chain.covariates)["skew"]
+        chain.output = chain.output + chain.scale_factor * skewed
