@@ -1,6 +1,7 @@
 // What a student hands in: nothing, or effects, each with what it could not be told from; confidence and reasons.
 
 import { h, say } from "./dom.js";
+import { runName } from "./lab_results.js";
 import { t } from "./text.js";
 
 /** answerForm({code, effects, answer, runs, onSubmit}) -> node; `effects` as /effects gives them, `answer` what was
@@ -14,15 +15,17 @@ export function answerForm({ code, effects, answer: handed, runs, onSubmit }) {
   const error = h("p", { class: "error", role: "alert" });
   const send = h("button", { class: "main", type: "submit" }, t("lab.submit"));
   const found = h("div", { class: "stack inset" }, rows, h("div", { class: "row" }, h("button", { type: "button", onclick: () => addRow([""]) }, t("lab.another"))));
+  const sure = h("p", { class: "small muted inset" }, t("lab.before_none"));
   const radio = (value, checked) => h("label", { class: "choice" }, h("input", { type: "radio", name: "claim", value, checked, onchange: show }), t(`lab.claim_${value}`));
   const confidence = h("input", { id: "confidence", type: "range", min: 0, max: 100, step: 5, value: answer?.confidence ?? 50, oninput: tell });
   const shown = h("output", { for: "confidence" });
   const reasoning = h("textarea", { id: "reasoning", rows: 5, maxlength: 4000 }, answer?.reasoning ?? "");
-  const basis = h("select", { id: "basis" }, [...runs].reverse().map(({ recording, name }) => h("option", { value: recording, selected: recording === handed?.recording }, name)), h("option", { value: "", selected: handed && !handed.recording }, t("lab.basis_none")));
+  const basis = h("select", { id: "basis" }, [...runs].reverse().map((run) => h("option", { value: run.recording, selected: run.recording === handed?.recording }, runName(run))), h("option", { value: "", selected: handed && !handed.recording }, t("lab.basis_none")));
 
   function tell() { shown.textContent = `${confidence.value} %`; }
   function show() {
     found.hidden = form.claim.value !== "found";
+    sure.hidden = form.claim.value !== "none";
     if (!found.hidden && !rows.children.length) addRow([""]);
   }
 
@@ -69,7 +72,7 @@ export function answerForm({ code, effects, answer: handed, runs, onSubmit }) {
     },
   },
   h("fieldset", { class: "stack" }, h("legend", { class: "label" }, t("lab.claim")),
-    radio("found", begun ? begun.claim === "found" : Boolean(answer?.findings.length)), found, radio("none", begun ? begun.claim === "none" : Boolean(answer && !answer.findings.length))),
+    radio("found", begun ? begun.claim === "found" : Boolean(answer?.findings.length)), found, radio("none", begun ? begun.claim === "none" : Boolean(answer && !answer.findings.length)), sure),
   h("div", {}, h("label", { for: "reasoning" }, t("lab.reasoning")), reasoning),
   h("div", {}, h("div", { class: "row spread" }, h("label", { for: "confidence" }, t("lab.confidence")), shown), confidence),
   h("div", {}, h("label", { for: "basis" }, t("lab.basis")), basis),

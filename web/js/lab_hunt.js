@@ -4,7 +4,7 @@ import { api, links } from "./api.js";
 import { h, table } from "./dom.js";
 import { answerForm } from "./lab_answer.js";
 import { motionEditor } from "./lab_motion.js";
-import { answerWords, truthList, verdictList } from "./lab_results.js";
+import { answerWords, runName, truthList, verdictList } from "./lab_results.js";
 import { lab, remember } from "./lab_student.js";
 import { notebook } from "./notebook.js";
 import { duration, t, when } from "./text.js";
@@ -53,7 +53,7 @@ export async function hunt(main, exercise, student) {
     editor.runs(runs, session);
     recordings.replaceChildren(runs.length
       ? table([t("lab.recording"), t("lab.done"), { n: t("lab.length") }, t("lab.data")], [...runs].reverse().map((run) => [
-        run.name, run.sentence, { n: duration(run.duration_s) },
+        runName(run), run.numbers.length > 1 ? t("lab.done_after", { numbers: run.numbers.slice(0, -1), motion: run.sentence }) : run.sentence, { n: duration(run.duration_s) },
         h("span", { class: "row" }, h("a", { class: "button open", href: links.workbench(run.recording, axis, { lab: code, notebook: student.notebook }) }, t("lab.open")),
           h("a", { href: links.recording(run.recording), download: "" }, "CSV"))]), { label: t("lab.step_look"), cards: true })
       : h("p", { class: "muted" }, t("lab.no_recording")));

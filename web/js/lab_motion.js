@@ -3,6 +3,7 @@
 import { api } from "./api.js";
 import { chart } from "./chart.js";
 import { h, say } from "./dom.js";
+import { runName } from "./lab_results.js";
 import { duration, plain, t } from "./text.js";
 
 const LISTS = { sine: ["amplitude_deg", "frequency_hz"], multisine: ["amplitude_deg", "frequency_hz"], staircase: ["rates_dps"], poses: ["angles_deg"], hold: [], heat: [] };
@@ -16,6 +17,8 @@ export function motionEditor(place, { exercise, student, onRun }) {
   const said = h("p", { class: "muted", "aria-live": "polite" });
   const joins = h("select", { id: "joins" });
   const restart = h("input", { type: "checkbox", id: "restart", onchange: () => { joins.disabled = restart.checked; } });
+  const more = h("div", { class: "pair", hidden: true }, h("div", {}, h("label", { for: "joins" }, t("lab.joins")), joins),
+    h("label", { class: "choice low", for: "restart" }, restart, t("lab.restart")));
   const run = h("button", { class: "main", type: "button", onclick: begin }, t("lab.run"));
   const picture = h("div", {});
   const plot = chart(picture, {
@@ -28,8 +31,7 @@ export function motionEditor(place, { exercise, student, onRun }) {
       type: "button", "data-offer": name, onclick: () => { motion.push(...structuredClone(steps)); draw(); },
     }, h("strong", {}, t(`lab.offer_${name}`)), h("span", { class: "small muted" }, t(`lab.why_${name}`))))),
     rows, picture, said,
-    h("div", { class: "pair" }, h("div", {}, h("label", { for: "joins" }, t("lab.joins")), joins),
-      h("label", { class: "choice low", for: "restart" }, restart, t("lab.restart"))),
+    more,
     error, h("div", { class: "row" }, run, h("span", { class: "small muted" }, t("lab.run_about"))));
 
   function draw() {
@@ -97,7 +99,8 @@ export function motionEditor(place, { exercise, student, onRun }) {
   return {
     runs(list, session) {
       const own = list.filter((one) => one.session === session).reverse();
-      joins.replaceChildren(...own.map(({ recording, name }) => h("option", { value: recording }, t("lab.joins_one", { name }))), h("option", { value: "" }, t("lab.joins_none")));
+      more.hidden = !list.length;
+      joins.replaceChildren(...own.map((one) => h("option", { value: one.recording }, t("lab.joins_one", { name: runName(one) }))), h("option", { value: "" }, t("lab.joins_none")));
     },
   };
 }

@@ -5,6 +5,9 @@ import { plain, t } from "./text.js";
 
 const either = (names, words) => names.map((name) => words[name] ?? name).join(` ${t("lab.or")} `);
 
+/** What a student's recording is called: the runs that are in it. */
+export const runName = ({ numbers }) => t("lab.run_name", { numbers: numbers.join(" + ") });
+
 /** "lag of the sensor or delay …; hysteresis", or that nothing is hidden. */
 export const answerWords = ({ findings }, words) => (findings.length ? findings.map((names) => either(names, words)).join("; ") : t("lab.nothing_hidden"));
 
