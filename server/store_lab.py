@@ -98,14 +98,27 @@ class Lab:
         rows, following = page(self._at, "select rowid as at, * from lab_students", ["code = ?"], [code], limit, cursor)
         return [_student(row) for row in rows], following
 
-    def answer(self, code: str, student: str, answer: Mapping[str, Any], diagnosis: Mapping[str, Any] | None) -> None:
+    def answer(self, code: str, student: str, answer: Mapping[str, Any]) -> None:
         """What a student hands in, in place of what was handed in before. Raises Problem once the truth is out."""
         with self._at.write() as db:
             if self._exercise(code)[0]["revealed_at"]:
                 raise Problem("lab.revealed")
-            said = None if diagnosis is None else dumps(dict(diagnosis))
-            changes = {"answer": dumps(dict(answer)), "diagnosis": said, "submitted_at": now()}
+            changes = {"answer": dumps(dict(answer)), "diagnosis": None, "submitted_at": now()}
             db.table("lab_students").update(student, changes)
+
+    def judge(self, student: str, recording: str, diagnosis: Mapping[str, Any]) -> None:
+        """What the instrument says of the recording that the answer rests on; of another it is forgotten."""
+        with self._at.write() as db:
+            found = self._at.rows("select answer from lab_students where id = ? and answer is not null", [student])
+            if found and json.loads(found[0]["answer"])["recording"] == recording:
+                db.table("lab_students").update(student, {"diagnosis": dumps(dict(diagnosis))})
+
+    def unjudged(self, code: str) -> list[tuple[str, str]]:
+        """Students whose answer rests on a recording that the instrument has not looked at, with the recording."""
+        where = "code = ? and answer is not null and diagnosis is null"
+        rows = self._at.rows(f"select id, answer from lab_students where {where}", [code])
+        resting = [(row["id"], json.loads(row["answer"])["recording"]) for row in rows]
+        return [(student, recording) for student, recording in resting if recording is not None]
 
     # --- runs ------------------------------------------------------------------------------------------------
     def next_run(self, student: str) -> int:

@@ -166,6 +166,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         download.value.save_as(tmp_path / "results.csv")
         (row,) = csv.DictReader(io.StringIO((tmp_path / "results.csv").read_text(encoding="utf-8-sig")))
         assert (row["name"], row["answer"], row["truth"], row["score"]) == ("Ann", "hysteresis", "hysteresis", "1.0")
+        assert row["instrument_verdict"], "the reveal waits for the instrument's word on every answer"
 
         bench.reload()
         bench.wait_for_selector(".about svg")

@@ -25,6 +25,7 @@ class Services:
         self.store = Store(settings.data)
         self.lease = Lease()
         self.compute = Compute()
+        self.bench = Compute()  # students' runs, a moment each, do not wait for a long diagnosis
         self.supervisor = Supervisor(settings, self.store)
         self.batches = BatchProcess(self.store)
 
@@ -37,6 +38,7 @@ class Services:
         self.supervisor.close()
         self.batches.close()
         self.compute.close()
+        self.bench.close()
         self.store.close()
 
 

@@ -3,7 +3,7 @@
 import secrets
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, Path
+from fastapi import APIRouter, BackgroundTasks, Depends, Header, Path
 from fastapi.responses import Response
 from pydantic import AfterValidator, BaseModel, Field
 
@@ -226,7 +226,7 @@ async def create(body: ExerciseBody, here: Here) -> Made:
         effects=chosen,
         noise=body.noise.model_dump() if body.noise else None,
     )
-    await here.compute.run(lab_bench.rehearse, hidden)
+    await here.bench.run(lab_bench.rehearse, hidden)
     code, key = here.store.lab.create(body.title, hidden, body.starter)
     return Made.model_validate(exercise(here, code) | {"key": key})
 
@@ -250,7 +250,7 @@ async def join(code: Code, body: StudentBody, here: Here, lang: Language) -> Stu
     known = here.store.lab.exercise(code)
     if known["starter"]:
         motion = lab_bench.starter(known["starter"], known["axis"])
-        await here.compute.run(lab_bench.run, here.store.data, code, who, motion, None, False)
+        await here.bench.run(lab_bench.run, here.store.data, code, who, motion, None, False)
     return student(here, code, who, lang)
 
 
@@ -280,14 +280,13 @@ async def run(code: Code, who: str, body: RunBody, here: Here, lang: Language) -
 
     here.store.lab.student(code, who)
     motion = [one.model_dump() for one in body.motion]
-    made = await here.compute.run(lab_bench.run, here.store.data, code, who, motion, body.joins, body.restart)
+    made = await here.bench.run(lab_bench.run, here.store.data, code, who, motion, body.joins, body.restart)
     return next(run for run in student(here, code, who, lang).runs if run.recording == made)
 
 
 @router.put("/{code}/students/{who}/answer", summary="Hand in an answer", responses=declared(404, 409))
-async def answer(code: Code, who: str, body: AnswerBody, here: Here, lang: Language) -> Student:
+def answer(code: Code, who: str, body: AnswerBody, here: Here, lang: Language, after: BackgroundTasks) -> Student:
     from calib_core.effects import library
-    from server import lab_bench
 
     row = here.store.lab.student(code, who)
     if here.store.lab.exercise(code)["revealed_at"]:
@@ -295,14 +294,23 @@ async def answer(code: Code, who: str, body: AnswerBody, here: Here, lang: Langu
     for name in (name for names in body.findings for name in names):
         if name not in library():
             raise Problem("effects.unknown", given=name, allowed=", ".join(library()))
-    said = None
     if body.recording is not None:
-        said = await here.compute.run(lab_bench.judged, here.store.data, code, who, body.recording)
+        here.store.lab.own_run(who, body.recording)
     given = body.model_dump()
-    here.store.lab.answer(code, who, given, said)
+    here.store.lab.answer(code, who, given)
     line = {name: given[name] for name in ("findings", "confidence", "reasoning")}
     here.store.notebooks.append(row["notebook"], "submitted", line)
+    if body.recording is not None:
+        after.add_task(judge, here, code, who, body.recording)
     return student(here, code, who, lang)
+
+
+async def judge(here: Services, code: str, who: str, recording: str) -> None:
+    """What the instrument says of the data that an answer rests on: for the grading of ties, once it is ready."""
+    from server import lab_bench
+
+    said = await here.compute.run(lab_bench.judged, here.store.data, code, who, recording)
+    here.store.lab.judge(who, recording, said)
 
 
 # --- for whoever has the key -------------------------------------------------------------------------------------
@@ -347,8 +355,10 @@ def table(code: Code, here: Here, lang: Language, key: Key = None) -> Response:
 
 
 @router.post("/{code}/reveal", summary="Let everybody see the truth; answers are closed", responses=declared(404))
-def reveal(code: Code, here: Here, key: Key = None) -> Exercise:
+async def reveal(code: Code, here: Here, key: Key = None) -> Exercise:
     here.store.lab.check_key(code, key)
+    for who, recording in here.store.lab.unjudged(code):
+        await judge(here, code, who, recording)
     here.store.lab.reveal(code)
     return Exercise.model_validate(exercise(here, code))
 

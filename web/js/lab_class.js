@@ -31,8 +31,15 @@ export async function classroom(main, exercise, key) {
   const twice = (text, again, work) => {
     const button = h("button", {
       type: "button",
-      onclick: () => {
-        if (button.dataset.sure) return attempt(work);
+      onclick: async () => {
+        if (button.dataset.sure) {
+          button.disabled = true;
+          button.textContent = t("lab.working");
+          await attempt(work);
+          button.disabled = false;
+          button.textContent = text;
+          return;
+        }
         button.dataset.sure = "yes";
         button.textContent = again;
       },
