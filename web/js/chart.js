@@ -206,7 +206,7 @@ export function chart(place, spec) {
       scales: { x: { time: false, distr: spec.x.log ? 3 : 1 }, y: { distr: spec.y.log ? 3 : 1, range: (_, low, high) => yRange(spec, state, low, high) } },
       axes: [
         axis({ label: axisLabel(spec.x), size: 26, values: (_, ticks) => tickWords(ticks, spec.x.log) }),
-        axis({ label: axisLabel(spec.y), size: 52, values: (_, ticks) => tickWords(ticks, spec.y.log) }),
+        axis({ label: axisLabel(spec.y), size: 52, space: 22, values: (_, ticks) => tickWords(ticks, spec.y.log) }),
       ],
       series: [{}, ...spec.series.map(seriesOptions)],
       cursor: {

@@ -64,6 +64,7 @@ function showRun(main, run, certificate) {
       h("div", { class: "row" },
         isOn ? h("a", { class: "button main", href: `/?run=${encodeURIComponent(run.id)}` }, t("run.watch")) : null,
         ...(run.certificate ? ["pdf", "csv", "json"].map((kind, i) => h("a", { class: `button ${i ? "" : "main"}`, href: links.document(run.certificate, kind), download: "" }, t(`document.${kind}`))) : []),
+        isOn ? null : h("a", { class: "button", href: links.workbench(run.recording, "x") }, t("run.workbench")),
         h("a", { class: "button", href: links.recording(run.recording), download: "" }, t("run.raw")),
         h("a", { class: "button", href: links.recording(run.recording, "fast.csv"), download: "" }, t("run.raw_fast")),
         run.certificate ? null : certify),

@@ -4,7 +4,7 @@ import { api, links } from "../api.js";
 import { h, say } from "../dom.js";
 import { notebook } from "../notebook.js";
 import { page } from "../shell.js";
-import { duration, t } from "../text.js";
+import { duration, has, t } from "../text.js";
 import { showCard } from "../workbench/card.js";
 import { experimentPanel, onRig } from "../workbench/experiment.js";
 import { formulaForm } from "../workbench/formula.js";
@@ -33,6 +33,7 @@ async function open(main, recording, row, signal) {
   const book = notebook();
   const cards = new Map();
   const own = new Map();
+  const name = row.source === "example" && has(`example.${row.name}.title`) ? t(`example.${row.name}.title`) : row.name || row.board || recording;
   const titles = (effect) => cards.get(effect)?.title ?? effect;
   const error = h("p", { class: "error", role: "alert" });
   const [seen, side, listed, cardPlace, nextPlace, keepPlace, bookPlace] = ["pictures stack", "side stack", "list stack", "panel stack about", "panel stack", "panel stack", "panel stack"]
@@ -47,7 +48,7 @@ async function open(main, recording, row, signal) {
 
   main.append(
     h("header", { class: "row spread opened" },
-      h("p", {}, h("strong", {}, row.name || row.board || recording), ` · ${t("workbench.axis", { axis })} · ${signal.samples.toLocaleString("en").replaceAll(",", " ")} ${t("workbench.samples")} · ${duration(signal.duration_s)}`),
+      h("p", {}, h("strong", {}, name), ` · ${t("workbench.axis", { axis })} · ${signal.samples.toLocaleString("en").replaceAll(",", " ")} ${t("workbench.samples")} · ${duration(signal.duration_s)}`),
       h("div", { class: "row" }, signal.axes.length > 1 ? h("nav", { class: "row axes", "aria-label": t("workbench.axes") }, signal.axes.map((one) => h("a", { class: "button", href: links.workbench(recording, one, carried), "aria-current": one === axis ? "page" : null }, one))) : null,
         carried.lab ? h("a", { class: "button", href: links.lab(carried.lab) }, t("workbench.back_to_lab")) : h("a", { class: "button", href: "/workbench.html" }, t("workbench.another"))), error),
     seen, h("aside", { class: "beside", "aria-label": t("workbench.error") }, side), h("div", { class: "evidence-row" }, listed, h("div", { class: "stack" }, cardPlace, formulaForm(addOwn))), h("div", { class: "columns of-model" }, nextPlace, h("div", { class: "stack" }, keepPlace, bookPlace)));
@@ -107,25 +108,26 @@ async function open(main, recording, row, signal) {
     if (!answer) return;
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
-    cardPlace.hidden = false;
     if (hidden) {
+      cardPlace.replaceChildren(h("p", { class: "muted" }, t("workbench.guess.read")));
       verdict.textContent = t("workbench.guess.hidden");
       form = guessForm(suspectsPlace, cards, {
         pointed: (covariate) => draw.pointing(true, covariate),
+        read: (effect) => show(effect, false),
         guessed(given) {
           guess = given.effect ?? "none";
           book.write({ step: "guessed", effects: given.effect ? [given.effect] : [], ...(given.covariate && { covariate: given.covariate }), ...(given.why && { why: given.why }) });
           book.write({ step: "verdict", code: answer.code, values: answer.values });
           refresh();
-          verdict.focus?.();
+          show(given.effect ?? answer.suspects[0].effect);
         },
       });
       return;
     }
     form = null;
     verdict.textContent = answer.sentence;
-    showSuspects(suspectsPlace, answer, { open: show, guess, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
-    if (!cardPlace.firstChild) show(answer.suspects[0].effect, false);
+    showSuspects(suspectsPlace, answer, { open: show, guess, decide, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
+    if (!cardPlace.querySelector("h2")) show(answer.suspects[0].effect, false);
   }
 
   async function show(effect, isAsked = true) {
@@ -153,7 +155,7 @@ async function open(main, recording, row, signal) {
 
   let rigName = "";
   document.addEventListener("rig-changed", ({ detail }) => { rigName = detail.simulated ? t("rig.simulated") : detail.url; });
-  experimentPanel(nextPlace, {
+  const next = experimentPanel(nextPlace, {
     ask: () => ({ recording, axis, effects: history[at]?.effects ?? [] }),
     rig: () => (carried.lab ? t("workbench.next.hidden_bench") : rigName),
     async run(experiment) {
@@ -168,6 +170,10 @@ async function open(main, recording, row, signal) {
       if (told.diagnosis) book.write({ step: "verdict", code: told.diagnosis.code, values: told.diagnosis.values });
     },
   });
+  function decide() {
+    nextPlace.scrollIntoView({ block: "nearest" });
+    next.propose();
+  }
   keepPanel(keepPlace, { ask: current });
   book.panel(bookPlace);
 
@@ -175,7 +181,7 @@ async function open(main, recording, row, signal) {
   (async () => {
     try {
       for (const card of (await api.effects()).items) cards.set(card.name, card);
-      book.write({ step: "opened", recording, name: row.name || row.board || recording, axis, samples: signal.samples, duration_s: signal.duration_s });
+      book.write({ step: "opened", recording, name, axis, samples: signal.samples, duration_s: signal.duration_s });
       await change([]);
       if (answer && !isGuessing.checked) book.write({ step: "verdict", code: answer.code, values: answer.values });
     } catch (problem) { say(error, problem); }

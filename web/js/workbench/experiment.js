@@ -59,7 +59,7 @@ export function experimentPanel(place, { ask, run, done, rig }) {
       go.textContent = t("workbench.next.run", { rig: rig() });
     }
   }
-  return { clear };
+  return { propose };
 }
 
 /** Runs a proposed experiment on the rig that is chosen, and waits for the verdict on all data together. */

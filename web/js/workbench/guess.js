@@ -4,8 +4,9 @@ import { h } from "../dom.js";
 import { t } from "../text.js";
 import { alongName } from "./pictures.js";
 
-/** The form in place of the suspects; guessed({effect, covariate, why}) is told once. */
-export function guessForm(place, cards, { guessed, pointed }) {
+/** The form in place of the suspects; guessed({effect, covariate, why}) is told once,
+ * read(effect) of a cause that is looked at, pointed(covariate) of a picture. */
+export function guessForm(place, cards, { guessed, pointed, read }) {
   const where = h("p", { class: "pointed" }, t("workbench.guess.point"));
   const names = [...cards.values()].sort((a, b) => a.title.localeCompare(b.title));
   const cause = h("select", { id: "guess-effect", required: true }, h("option", { value: "" }, t("workbench.guess.choose")),
@@ -14,7 +15,7 @@ export function guessForm(place, cards, { guessed, pointed }) {
   const show = h("button", { type: "submit", class: "main", id: "show-evidence", disabled: true }, t("workbench.guess.show"));
   let covariate = null;
   const ready = () => { show.disabled = !cause.value || (cause.value !== "none" && !covariate); };
-  cause.addEventListener("change", ready);
+  cause.addEventListener("change", () => { ready(); read(cause.value); });
   place.replaceChildren(h("form", {
     class: "stack guess",
     onsubmit: (event) => {

@@ -2,7 +2,7 @@
 
 import { chart } from "../chart.js";
 import { h } from "../dom.js";
-import { fixed, t } from "../text.js";
+import { t } from "../text.js";
 
 const GROUP = "workbench";
 const UNIT = { rate: "deg/s", position: "deg", acceleration: "deg/s²", temperature: "°C", time: "s", supply: "V", other_rate: "deg/s" };
@@ -23,6 +23,8 @@ export function pictures(place, { unit, detail, pointed }) {
   let shown = null;
   let base = 0;
   let waiting = 0;
+  let compared = null;
+  let isHiding = false;
 
   const overlay = chart(traces, {
     name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t("chart.output"), unit, digits: 4 },
@@ -88,47 +90,51 @@ export function pictures(place, { unit, detail, pointed }) {
     return largest > base / STEADY ? base : largest;
   }
 
+  /** Everything of the model that is shown; in guessing without a word of where it fails. */
+  function draw() {
+    const { columns: c, along } = shown;
+    const failures = isHiding ? [] : shown.failures;
+    const y = reach(c, along);
+    residual.set([c.window_s, c.residual, compared ? compared.columns.residual : new Array(c.window_s.length).fill(null)], {
+      band: { x: c.window_s, half: c.spread.map((s) => 2 * s) }, limits: [-y, y],
+      shade: failures.filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
+    });
+    residual.rename(compared ? t("workbench.residual_two") : t("workbench.residual"), t("chart.residual"));
+    sentence.textContent = isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits");
+    for (const one of along) {
+      if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
+      const { plot, says, figure } = multiples.get(one.covariate);
+      const at = (part) => c[`${one.covariate}/${part}`];
+      const failing = failures.find((f) => f.covariate === one.covariate);
+      plot.set(merged(at("at"), at("residual"), at("middle"), at("mean")), {
+        band: { x: at("middle"), half: at("sigma").map((s) => 2 * s) }, limits: [-y, y],
+        shade: failing ? [[failing.from, failing.to]] : [],
+      });
+      says.textContent = isHiding ? "" : failing ? failing.sentence : t("workbench.no_failure");
+      figure.classList.toggle("failing", Boolean(failing));
+    }
+    if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
+    spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(shown.white_density)]);
+  }
+
   return {
     signal({ columns }) {
       overlay.set([columns.time_s, columns.measured, new Array(columns.time_s.length).fill(null)]);
     },
     /** A fit, and beside its residual that of another model where two are compared. */
     fit(fit, other = null) {
-      shown = fit;
-      const { columns: c, along, failures } = fit;
-      const y = reach(c, along);
+      [shown, compared] = [fit, other];
       drawSignal(fit);
-      residual.set([c.window_s, c.residual, other ? other.columns.residual : new Array(c.window_s.length).fill(null)], {
-        band: { x: c.window_s, half: c.spread.map((s) => 2 * s) }, limits: [-y, y],
-        shade: failures.filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
-      });
-      const worst = failures[0];
-      sentence.textContent = worst ? worst.sentence : t("workbench.fits");
-      for (const one of along) {
-        if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
-        const { plot, says, figure } = multiples.get(one.covariate);
-        const at = (part) => c[`${one.covariate}/${part}`];
-        const failing = failures.find((f) => f.covariate === one.covariate);
-        plot.set(merged(at("at"), at("residual"), at("middle"), at("mean")), {
-          band: { x: at("middle"), half: at("sigma").map((s) => 2 * s) }, limits: [-y, y],
-          shade: failing ? [[failing.from, failing.to]] : [],
-        });
-        says.textContent = failing ? failing.sentence : t("workbench.no_failure");
-        figure.classList.toggle("failing", Boolean(failing));
-      }
-      if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
-      spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(fit.white_density)]);
-      residual.rename(other ? t("workbench.residual_two") : t("workbench.residual", { sigma: fixed(2 * median(c.spread), 3) }), t("chart.residual"));
+      draw();
     },
     /** In guessing, each picture can be pointed at. */
     pointing(on, covariate = null) {
       grid.classList.toggle("pointing", on);
+      if (on !== isHiding) { isHiding = on; if (shown) draw(); }
       for (const [name, { here }] of multiples) here.setAttribute("aria-pressed", String(name === covariate));
     },
   };
 }
-
-const median = (values) => Float64Array.from(values).sort()[values.length >> 1];
 
 /** Points and a curve with places of its own in one table, as a chart wants them. */
 function merged(x1, y1, x2, y2) {
