@@ -63,6 +63,7 @@ async function open(main, recording, row, signal) {
   const draw = pictures(seen, { unit, detail: ([begin_s, end_s]) => fit(history[at].effects, { begin_s, end_s }), pointed: (along) => form?.point(along) });
   const bench = ledger(side, { undo: () => change(history[at].effects.slice(0, -1)), compare });
   draw.signal(signal);
+  performance.mark("first-plot");
 
   const fit = (effects, part = {}) => api.fit(recording, { axis, effects, formulas: effects.filter((name) => own.has(name)).map((name) => own.get(name)), ...part });
 

@@ -1,0 +1,197 @@
+"""The workbench as a student uses it: look, suspect, read, add, compare, guess, run the motion that decides."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from browser import PHONE, Server, Window, chromium, serving
+
+LIMIT_KB = 300
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("data")) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def opened(server: Server) -> str:
+    """The address of an example's recording: a slow sine of a gyro whose answer lags by 5 ms."""
+    made = server.call("POST", "/examples/one_sine")
+    path = f"/recordings/{made['recording']}"
+    server.call("GET", f"{path}/suspects?axis=x", seconds=120)  # looked through once; pages then come at once
+    return f"/workbench.html?recording={made['recording']}&axis=x"
+
+
+@pytest.fixture
+def window(browser: Any, server: Server) -> Iterator[Window]:
+    window = Window(browser, server)
+    yield window
+    window.close()
+
+
+def ready(window: Window, path: str) -> Any:
+    page = window.open(path)
+    page.wait_for_selector(".suspects li")
+    return page
+
+
+def error(window: Window) -> float:
+    return float(window.text("#held-out").split()[0])
+
+
+def add(page: Any, effect: str, steps: int) -> None:
+    if not page.locator(f"[data-effect={effect}] .add").is_visible():
+        page.click(".list details summary")
+    page.click(f"[data-effect={effect}] .add")
+    page.wait_for_selector(f".steps-bought li:nth-child({steps})")
+    page.wait_for_selector(f"[data-effect={effect}].in_model")
+
+
+def test_an_example_opens_with_pictures_words_and_suspects(window: Window) -> None:
+    page = window.open("/workbench.html")
+    page.click(".example:has-text('One sine')")
+    page.wait_for_selector(".suspects .tied li:nth-child(2)")
+    assert "The model reads" in window.text(".says")
+    assert page.locator(".multiple .u-wrap").count() >= 5
+    assert page.locator(".multiple.failing .fails").count() >= 1
+    assert "noise alone makes" in window.text("#floor")
+    assert "cannot tell" in window.text(".verdict")
+    assert page.locator(".about svg").count() == 1
+    assert page.locator(".suspects .no_data .add").count() == 0
+
+
+def test_the_signal_is_there_within_a_second(window: Window, opened: str) -> None:
+    window.open(opened)
+    ms = window.page.evaluate("performance.getEntriesByName('first-plot')[0].startTime")
+    assert ms < 2500, f"{ms} ms; 1000 on a machine that does nothing else"
+
+
+def test_an_effect_lowers_the_error_a_useless_one_buys_nothing_and_undo_takes_it_back(
+    window: Window, opened: str
+) -> None:
+    page = ready(window, opened)
+    before = error(window)
+    add(page, "bandwidth_lag", 2)
+    after = error(window)
+    assert after < 0.3 * before
+    assert "explains this recording" in window.text(".says")
+    assert float(page.get_attribute("#held-out", "data-ms")) < 1500, "300 where nothing else runs"
+    add(page, "bias_drift", 3)
+    assert "buys nothing" in window.text(".steps-bought li:nth-child(3)")
+    assert "take it out" in window.text("#bought")
+    page.click("#undo")
+    page.wait_for_selector(".steps-bought li:nth-child(3)", state="detached")
+    assert error(window) == after
+    page.select_option("#other", label="bias and scale factor")
+    page.wait_for_selector(".side table:has-text('other')")
+    assert "lag of the sensor" in window.text(".side table:has-text('other')")
+
+
+def test_a_card_tells_of_an_effect_and_leads_to_those_it_is_confused_with(window: Window, opened: str) -> None:
+    page = ready(window, opened)
+    page.click("[data-effect=bandwidth_lag] .name")
+    page.wait_for_selector(".about h2:has-text('lag of the sensor')")
+    assert page.evaluate("document.activeElement.textContent") == "lag of the sensor"
+    assert "33 kΩ" in window.text(".about dl")
+    page.wait_for_selector(".about svg text")
+    page.click(".about .word >> nth=0")
+    page.wait_for_selector(".about h2:has-text('delay')")
+
+
+def test_ones_own_formula_is_fitted_or_refused_with_the_place(browser: Any, server: Server, opened: str) -> None:
+    window = Window(browser, server)
+    page = ready(window, opened)
+    page.click(".own-formula summary")
+    page.fill("#own-formula", "acceleration_dps2 * speed")
+    page.click(".own-formula button")
+    page.wait_for_selector(".own-formula .error:has-text('speed')")
+    page.fill("#own-formula", "acceleration_dps2")
+    page.click(".own-formula button")
+    page.wait_for_selector(".steps-bought li:nth-child(2):has-text('my_effect')")
+    assert "my_effect: k" in window.text(".side table")
+    window.close(refusals=1)
+
+
+def test_guessing_hides_the_evidence_until_a_picture_and_a_cause_are_named(window: Window, opened: str) -> None:
+    page = ready(window, opened)
+    page.check("#guess-first")
+    page.wait_for_selector("#guess-effect")
+    assert page.locator(".suspects, .multiple.failing").count() == 0
+    assert page.is_disabled("#show-evidence")
+    page.click("[data-along=x_acceleration_dps2] .point")
+    page.select_option("#guess-effect", "bandwidth_lag")
+    page.fill("#guess-why", "it grows with acceleration")
+    page.click("#show-evidence")
+    page.wait_for_selector(".suspects .guessed:has-text('Your guess')")
+    page.wait_for_selector(".lines:has-text('it grows with acceleration')")
+    assert "the acceleration of x" in window.text(".lines")
+
+
+def test_the_motion_that_decides_is_shown_run_and_judged_with_the_data_in_hand(window: Window, opened: str) -> None:
+    page = ready(window, opened)
+    page.click(".decide")
+    page.wait_for_selector("#run-experiment", timeout=60_000)
+    assert "4.0313" in window.text("section:has(> div > #propose)")
+    page.click("#run-experiment")
+    page.wait_for_selector("#open-joined", timeout=90_000)
+    assert "lacks lag of the sensor" in window.text("section:has(> div > #propose)")
+    page.wait_for_selector(".lines:has-text('experiment')")
+    page.click("#open-joined")
+    page.wait_for_selector(".suspects li")
+    page.wait_for_selector(".verdict:has-text('lacks lag of the sensor')")
+
+
+def test_zoom_is_shared_and_arrow_keys_read_values_out(window: Window, opened: str) -> None:
+    page = ready(window, opened)
+    plot = page.locator(".traces .plot").first
+    box = plot.bounding_box()
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 60)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 60, steps=4)
+    page.mouse.up()
+    plot.press("ArrowLeft")
+    page.wait_for_selector(".traces .readout:has-text('measured') >> nth=0")
+    reads = page.locator(".traces .readout").all_inner_texts()
+    assert "model" in reads[0]
+    assert float(reads[0].split()[1]) < 60.0, "the cursor begins at the end of what is shown"
+    plot.press("Escape")
+
+
+@pytest.mark.parametrize("locale", ["en-US", "th-TH"])
+def test_the_page_is_light_without_its_data(browser: Any, server: Server, opened: str, locale: str) -> None:
+    window = Window(browser, server, locale=locale)
+    kept: dict[str, int] = {}
+
+    def weigh(request: Any) -> None:
+        if "/api/" not in request.url:
+            kept[request.url.removeprefix(server.url)] = request.sizes()["responseBodySize"]
+
+    window.page.on("requestfinished", weigh)
+    ready(window, opened)
+    window.close()
+    assert len(kept) > 20
+    assert sum(kept.values()) < LIMIT_KB * 1000, sorted(kept.items(), key=lambda item: -item[1])[:8]
+
+
+@pytest.mark.parametrize("locale", ["en-US", "th-TH"])
+def test_nothing_scrolls_sideways_or_jumps_on_a_phone(browser: Any, server: Server, opened: str, locale: str) -> None:
+    window = Window(browser, server, viewport=PHONE, locale=locale)
+    window.page.add_init_script(
+        "window.shift = 0; new PerformanceObserver(list => { for (const e of list.getEntries())"
+        " if (!e.hadRecentInput) shift += e.value; }).observe({ type: 'layout-shift', buffered: true });"
+    )
+    page = ready(window, opened)
+    assert window.widest() <= PHONE["width"]
+    assert page.evaluate("shift") < 0.1
+    window.open("/workbench.html")
+    page.wait_for_selector(".example")
+    assert window.widest() <= PHONE["width"]
+    window.close()
