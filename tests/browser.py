@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -118,3 +118,23 @@ class Window:
         others = [line for line in self.complaints if line not in refused]
         assert not others, others
         assert len(refused) <= refusals, refused
+
+
+def serious(browser: Any, server: Server, paths: Sequence[str]) -> list[str]:
+    """What axe-core calls serious or critical on these pages, dark and light in turn."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    found = []
+    # The pages' own policy forbids the script that axe is.
+    context = browser.new_context(viewport=DESK, locale="en-US", base_url=server.url, bypass_csp=True)
+    page = context.new_page()
+    for k, path in enumerate(paths):
+        page.emulate_media(color_scheme=("light", "dark")[k % 2])
+        page.goto(path)
+        page.wait_for_selector("html[data-ready]")
+        page.wait_for_load_state("networkidle")
+        for violation in Axe().run(page).response["violations"]:
+            if violation["impact"] in ("serious", "critical"):
+                found.append(f"{path}: {violation['id']}: {violation['nodes'][0]['html'][:200]}")
+    context.close()
+    return found

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serving
+from browser import PHONE, Server, Window, chromium, serious, serving
 
 PAGES = (
     "/",
@@ -65,6 +65,12 @@ def test_no_page_scrolls_sideways_on_a_phone(browser: Any, server: Server, local
         assert stop["height"] >= 48
         assert stop["y"] + stop["height"] <= PHONE["height"], f"{path}: the stop is not on the screen"
     window.close()
+
+
+def test_axe_finds_nothing_serious_on_any_page(browser: Any, server: Server) -> None:
+    run = server.call("GET", "/runs")["items"][0]["id"]
+    paths = [*PAGES, f"/run.html?id={run}", "/boards.html?id=LPY-A", "/compare.html?a=LPY-A&b=LPY-B"]
+    assert serious(browser, server, paths) == []
 
 
 def test_search_finds_a_board_and_says_when_there_is_none(window: Window) -> None:

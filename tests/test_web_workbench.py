@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serving
+from browser import PHONE, Server, Window, chromium, serious, serving
 
 LIMIT_KB = 300
 
@@ -195,3 +195,7 @@ def test_nothing_scrolls_sideways_or_jumps_on_a_phone(browser: Any, server: Serv
     page.wait_for_selector(".example")
     assert window.widest() <= PHONE["width"]
     window.close()
+
+
+def test_axe_finds_nothing_serious(browser: Any, server: Server, opened: str) -> None:
+    assert serious(browser, server, [opened, "/workbench.html"]) == []
