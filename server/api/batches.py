@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
-from pydantic import BaseModel, ConfigDict
 from starlette.concurrency import run_in_threadpool
 
 from calib_core.problem import Problem
@@ -43,11 +42,7 @@ Key = Annotated[str | None, Header(max_length=200, description="makes a repeated
 FileStatus = Literal["waiting", "done", "failed", "cancelled"]
 
 
-class Shown(BaseModel):
-    model_config = ConfigDict(defer_build=True)
-
-
-class Batch(Shown):
+class Batch(models.Plain):
     id: str
     name: str
     status: Literal["queued", "running", "finished", "cancelled"]
@@ -66,12 +61,12 @@ class Batch(Shown):
     finished_at: str | None
 
 
-class Batches(Shown):
+class Batches(models.Plain):
     items: list[Batch]
     next: str | None
 
 
-class BatchFile(Shown):
+class BatchFile(models.Plain):
     position: int
     name: str
     size: int
@@ -87,7 +82,7 @@ class BatchFile(Shown):
     finished_at: str | None
 
 
-class BatchFiles(Shown):
+class BatchFiles(models.Plain):
     items: list[BatchFile]
     next: str | None
 

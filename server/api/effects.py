@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from server import diagnosis
 from server.api import models
@@ -27,7 +27,7 @@ class EffectBody(models.Body):
     note: models.Note = ""
 
 
-class Parameter(BaseModel):
+class Parameter(models.Plain):
     name: str
     unit: str = Field(description="{out} stands for the recording's unit")
     typical: float
@@ -35,7 +35,7 @@ class Parameter(BaseModel):
     grid: list[float] = Field(description="where the search begins; empty for a linear parameter")
 
 
-class Effect(BaseModel):
+class Effect(models.Plain):
     """One physical effect: where it acts, what it is, how it shows, and how to provoke it."""
 
     name: str
@@ -57,7 +57,7 @@ class Effect(BaseModel):
     created_at: str | None = None
 
 
-class Effects(BaseModel):
+class Effects(models.Plain):
     items: list[Effect]
     next: None = None
 

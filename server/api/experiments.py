@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from server import diagnosis, experiments, texts
 from server.api import models
@@ -63,7 +63,7 @@ class Experiment(models.Answer):
     created_at: str
 
 
-class Experiments(BaseModel):
+class Experiments(models.Plain):
     items: list[Experiment]
     next: str | None
 

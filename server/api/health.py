@@ -4,15 +4,15 @@ import time
 from typing import Literal
 
 from fastapi import APIRouter
-from pydantic import BaseModel
 
 from server import __version__
 from server.api.common import Here
+from server.api.models import Plain
 
 router = APIRouter(tags=["health"])
 
 
-class Health(BaseModel):
+class Health(Plain):
     status: Literal["ok"] = "ok"
     version: str = __version__
     worker: Literal["ready", "starting", "dead"]

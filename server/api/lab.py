@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, BackgroundTasks, Depends, Header, Path
 from fastapi.responses import Response
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, Field
 
 from calib_core.problem import Problem
 from calib_core.strengths import DIFFICULTIES, SCALE, STRONGEST
@@ -76,7 +76,7 @@ class AnswerBody(models.Body):
     recording: Annotated[str, Field(max_length=64)] | None = Field(None, description="the own recording it rests on")
 
 
-class Offer(BaseModel):
+class Offer(models.Plain):
     name: str
     motion: list[dict[str, Any]]
 
@@ -124,7 +124,7 @@ class Student(models.Answer):
     diagnosis: dict[str, Any] | None
 
 
-class Preview(BaseModel):
+class Preview(models.Plain):
     duration_s: float
     sentence: str
     time_s: list[float]
@@ -143,13 +143,13 @@ class Result(models.Answer):
     diagnosis: dict[str, Any] | None
 
 
-class Results(BaseModel):
+class Results(models.Plain):
     items: list[Result]
     next: str | None
     truth: dict[str, Any]
 
 
-class Hideable(BaseModel):
+class Hideable(models.Plain):
     effects: list[str]
     difficulties: list[str]
     strongest: float

@@ -54,6 +54,12 @@ class Answer(BaseModel):
     model_config = ConfigDict(extra="allow", defer_build=True)
 
 
+class Plain(BaseModel):
+    """These fields and no others; like all of them, built when it is first asked for."""
+
+    model_config = ConfigDict(defer_build=True)
+
+
 # --- boards and gyro models ------------------------------------------------------------------------------------
 class BoardBody(Body):
     id: BoardId
@@ -75,7 +81,7 @@ class Board(Answer):
     certificates: int | list[dict[str, Any]] | None = None
 
 
-class Boards(BaseModel):
+class Boards(Plain):
     items: list[Board]
     next: str | None
 
@@ -120,7 +126,7 @@ class GyroModelAnswer(Answer):
     output_max_V: float
 
 
-class GyroModels(BaseModel):
+class GyroModels(Plain):
     items: list[GyroModelAnswer]
     next: None = None
 
@@ -146,24 +152,24 @@ class RunBody(Body):
     speed: Speed | None = None
 
 
-class StatePlan(BaseModel):
+class StatePlan(Plain):
     name: StateName
     seconds: float
     readings: int
 
 
-class PlanAnswer(BaseModel):
+class PlanAnswer(Plain):
     states: list[StatePlan]
     seconds: float
 
 
-class Message(BaseModel):
+class Message(Plain):
     code: str
     values: dict[str, Any]
     sentence: str
 
 
-class RunState(BaseModel):
+class RunState(Plain):
     name: AnyState
     status: Literal["waiting", "running", "done", "failed", "kept"]
     result: dict[str, Any] | None
@@ -193,12 +199,12 @@ class Run(Answer):
     results: dict[str, Any]
 
 
-class Runs(BaseModel):
+class Runs(Plain):
     items: list[Run]
     next: str | None
 
 
-class Series(BaseModel):
+class Series(Plain):
     columns: dict[str, list[float | None]]
 
 
@@ -216,7 +222,7 @@ class RecordingAnswer(Answer):
     created_at: str
 
 
-class Recordings(BaseModel):
+class Recordings(Plain):
     items: list[RecordingAnswer]
     next: str | None
 
@@ -236,7 +242,7 @@ class CertificateRow(Answer):
     operator: str
 
 
-class Certificates(BaseModel):
+class Certificates(Plain):
     items: list[CertificateRow]
     next: str | None
 
@@ -282,7 +288,7 @@ class ReferenceBody(Body):
     axes: dict[Axis, EncoderPairs]
 
 
-class ReferenceGain(BaseModel):
+class ReferenceGain(Plain):
     """What follows for one axis: true degrees for one of the encoder's, and its relative standard uncertainty."""
 
     scale: float
@@ -299,17 +305,17 @@ class LeaseBody(Body):
     holder: Annotated[str, Field(min_length=1, max_length=80), _LINE, AfterValidator(_one_line)]
 
 
-class Lease(BaseModel):
+class Lease(Plain):
     token: str
     expires_at: str
 
 
-class Held(BaseModel):
+class Held(Plain):
     holder: str
     expires_at: str
 
 
-class Part(BaseModel):
+class Part(Plain):
     part: str
     ok: bool | None
     code: str

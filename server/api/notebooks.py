@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
 from fastapi.responses import Response
-from pydantic import BaseModel, Field, model_validator
+from pydantic import Field, model_validator
 
 from server import compute, notebook
 from server.api import models
@@ -131,7 +131,7 @@ class Notebook(models.Answer):
     lines: int
 
 
-class Notebooks(BaseModel):
+class Notebooks(models.Plain):
     items: list[Notebook]
     next: str | None
 

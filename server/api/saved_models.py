@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from server import compute
 from server.api import models
@@ -23,7 +23,7 @@ class ModelBody(models.Body):
     note: models.Note = ""
 
 
-class Parameter(BaseModel):
+class Parameter(models.Plain):
     name: str
     value: float
     unit: str
@@ -48,7 +48,7 @@ class Model(models.Answer):
     created_at: str
 
 
-class Models(BaseModel):
+class Models(models.Plain):
     items: list[Model]
     next: str | None
 

@@ -4,11 +4,11 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from server import compute, examples, workbench
 from server.api.common import Here, Language
-from server.api.models import Answer, Body
+from server.api.models import Answer, Body, Plain
 from server.problems import declared
 from server.texts import render
 
@@ -61,14 +61,14 @@ class Suspects(Answer):
     suspects: list[Suspect]
 
 
-class Path(BaseModel):
+class Path(Plain):
     """Where the axes that move are sent."""
 
     time_s: list[float]
     angle_deg: dict[str, list[float]]
 
 
-class Example(BaseModel):
+class Example(Plain):
     name: str
     title: str
     story: str
@@ -76,7 +76,7 @@ class Example(BaseModel):
     recording: str | None = Field(description="null until it is asked for with POST")
 
 
-class Examples(BaseModel):
+class Examples(Plain):
     items: list[Example]
     next: None = None
 
