@@ -21,6 +21,8 @@ WORKERS = "GYROBENCH_WORKERS"
 WORKER_BYTES = 600_000_000
 """What a worker may need for an ordinary session, twice over; there are as many as cores and memory allow."""
 CONNECT_S = 15.0
+NOBODY_S = 60.0
+"""A cluster without any worker for so long is no cluster."""
 AHEAD = 2
 """Files a worker has: one at work, one waiting there so that it need not wait for us."""
 
@@ -55,6 +57,8 @@ class Cluster:
                 "distributed.scheduler.allowed-failures": 0,
                 "distributed.admin.large-graph-warning-threshold": "1GB",  # files travel with their tasks
                 "distributed.comm.timeouts.connect": CONNECT_S,
+                # A worker that dies again while it is being started again would be given up for ever.
+                "distributed.deploy.lost-worker-timeout": "365 days",
                 "distributed.scheduler.http.routes": [],
                 "distributed.worker.http.routes": [],
             }
@@ -108,8 +112,11 @@ class Cluster:
     @property
     def places(self) -> int:
         """Files that may be on their way at once."""
-        threads = self._client.scheduler_info().get("total_threads", 0)
-        return AHEAD * max(1, int(threads))
+        return AHEAD * max(1, self._threads)
+
+    @property
+    def _threads(self) -> int:
+        return int(self._client.scheduler_info().get("total_threads", 0))
 
     async def run(self, work: Callable[..., T], *arguments: object) -> T:
         """What ``work`` gives, on some worker, as soon as there is a place.
@@ -133,12 +140,17 @@ class Cluster:
         from distributed import CancelledError
 
         future = self._client.submit(work, *arguments, pure=False)
+        result = asyncio.ensure_future(future)
         try:
-            result: T = await future
-            return result
+            while not (await asyncio.wait({result}, timeout=NOBODY_S))[0]:
+                if not self._threads:
+                    raise OSError("no worker")
+            found: T = result.result()
+            return found
         except (CancelledError, OSError) as error:
             raise Problem("batch.cluster_gone", address=self._client.scheduler.address, reason=str(error)) from None
         finally:
+            result.cancel()
             with suppress(Exception):
                 future.release()
 

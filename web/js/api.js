@@ -115,6 +115,30 @@ export const api = {
     form.append("file", file);
     return call("POST", "/recordings", form);
   },
+  batches: (q) => call("GET", `/batches${query(q)}`),
+  batch: (batch) => call("GET", `/batches/${id(batch)}`),
+  batchFiles: (batch, q) => call("GET", `/batches/${id(batch)}/files${query(q)}`),
+  retryBatch: (batch) => call("POST", `/batches/${id(batch)}/retry`),
+  cancelBatch: (batch) => call("POST", `/batches/${id(batch)}/cancel`),
+  /** Sends a form with many files; `told(part)` hears how much has gone. A key makes sending it again harmless. */
+  sendBatch: (form, key, told) => new Promise((resolve, reject) => {
+    // fetch does not tell how far an upload is.
+    const request = new XMLHttpRequest();
+    request.open("POST", `${ROOT}/batches`);
+    const token = localStorage.getItem(TOKEN);
+    const headers = { "Accept-Language": language, "Idempotency-Key": key, ...(token && { Authorization: `Bearer ${token}` }) };
+    for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
+    request.responseType = "json";
+    request.upload.onprogress = ({ loaded, total }) => told(loaded / total);
+    request.onerror = () => reject(new Refused({ detail: t("page.unreachable") }, 0));
+    request.onload = () => {
+      if (request.status < 300) return resolve(request.response);
+      const refused = new Refused(request.response ?? {}, request.status);
+      if (request.status === 401) document.dispatchEvent(new CustomEvent("token-needed", { detail: refused }));
+      return reject(refused);
+    };
+    request.send(form);
+  }),
   verify: (number) => call("GET", `/certificates/${id(number)}/verify`),
 
   beginNotebook: (body) => call("POST", "/notebooks", body),
@@ -161,6 +185,8 @@ export const links = {
   workbench: (recording, axis, more = {}) => `/workbench.html${query({ recording, axis, ...more })}`,
   model: (model, kind) => `${ROOT}/models/${id(model)}.${kind}`,
   drawing: (effect) => `/effects/${id(effect)}.svg`,
+  batch: (batch) => `/batch.html${query({ id: batch })}`,
+  batchResults: (batch, kind) => `${ROOT}/batches/${id(batch)}/results.${kind}${query({ lang: kind === "zip" ? language : null })}`,
   run: (run) => `/run.html${query({ id: run })}`,
   board: (board) => `/boards.html${query({ id: board })}`,
   compare: (a, b) => `/compare.html${query({ a, b })}`,

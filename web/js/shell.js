@@ -5,7 +5,7 @@ import { $, h } from "./dom.js";
 import { chooseLanguage, clock, language, loadTexts, t, translate } from "./text.js";
 
 const PAGES = [
-  ["calibrate", "/"], ["workbench", "/workbench.html"], ["boards", "/boards.html"], ["certificates", "/certificates.html"], ["lab", "/lab.html"],
+  ["calibrate", "/"], ["workbench", "/workbench.html"], ["boards", "/boards.html"], ["certificates", "/certificates.html"], ["batch", "/batch.html"], ["lab", "/lab.html"],
   ["compare", "/compare.html"], ["rig", "/rig.html"], ["thesis", "/thesis.html"],
 ];
 const RIG_EVERY_MS = 5000;
