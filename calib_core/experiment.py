@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_core import gap_unknown
 from calib_core.contest import Columns, Contest, sizes_in, values_of
-from calib_core.effects import Acts, Effect
+from calib_core.effects import Effect
 from calib_core.excitation import Excitation, menu
 from calib_core.gap import BY_ITSELF, Diagnosis
 from calib_core.gap_space import Space, Term
@@ -285,10 +285,10 @@ def _groups(names: Sequence[str], tied: Sequence[tuple[str, str]]) -> tuple[tupl
 
 def _visited(space: Space, covariate: str) -> float:
     """How much a record says about shapes along ``covariate``: their whitened squares beside the base, summed."""
-    shapes = gap_unknown._shapes(space).get(covariate)
+    shapes = dict(gap_unknown._shapes(space)).get(covariate)
     if shapes is None:
         return 0.0
-    white = space.whitener.whiten(np.column_stack([space.base, space.over_rows(Acts.OUTPUT, shapes)]))
+    white = space.whitener.whiten(np.column_stack([space.base, shapes]))
     base = white[:, : space.base.shape[1]]
     free = white[:, base.shape[1] :]
     free = free - base @ np.linalg.lstsq(base, free, rcond=1e-10)[0]

@@ -126,9 +126,11 @@ def prepare(recording: Recording, axis: str, mask: NDArray[np.bool_] | None = No
     scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")
     c = covariates.of(recording, axis, design, float(rough[0]), scale_factor)
     space = Space(design, c, rough)
-    # The base is now known well: the covariates, and the space about them, once more.
-    if len(space.values) > 1:
-        space = Space(design, covariates.of(recording, axis, design, *space.values.tolist()), space.values)
+    if len(values := space.values) > 1:
+        # The base is now known well: the covariates, and the space about them, once more.
+        del space, c
+        space = Space(design, covariates.of(recording, axis, design, *values.tolist()), values)
+    design.averages.forget()
     return space
 
 

@@ -27,7 +27,7 @@ REST = 0.1
 RIVAL = 6.0
 """2ΔlnL within which two explanations cannot be told apart."""
 MOST = 3
-STEP_EVERY_S = 4.0
+STEP_EVERY_S, STEPS = 4.0, 40.0
 CLEAN = 1e-3
 """Of a column's square, what must be its own to stand beside others while the noise is estimated."""
 FIELD = 8
@@ -350,7 +350,7 @@ def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:
     """The grid of the effect's nonlinear parameters; times of a step lie all along the record."""
     if effect.name == "bias_step":
         end = float(space.covariates.time_s[-1])
-        step = max(STEP_EVERY_S, end / 100.0)
+        step = max(STEP_EVERY_S, end / STEPS)
         return [(float(t),) for t in np.arange(step, end - step / 2.0, step)]
     return list(product(*(effect.parameters()[name].grid for name in effect.nonlinear())))
 

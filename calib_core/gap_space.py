@@ -31,8 +31,8 @@ LATE = 0.01
 """Lateness below this share of a sampling interval is as good as none."""
 REMEMBERED = 24
 """So many terms beside the listed ones are kept whitened."""
-TOGETHER = 16
-"""So many terms are whitened at a time."""
+TOGETHER = 8
+"""So many terms, or columns, are whitened at a time."""
 LONG = 60_000
 """Rows from which columns are kept in single precision: they are long, and rounding them is like noise of 10⁻⁷."""
 
@@ -173,6 +173,11 @@ class Space:
         self.prior = np.append(self.prior, prior)
         self.use_noise(self.noise)
 
+    def forget(self) -> None:
+        """Gives the memory of a long record's whitened columns back; they are made again when they are asked for."""
+        if len(self.rows) > LONG:
+            self._bank = None
+
     def enlist(self, terms: Sequence[Term]) -> None:
         """These will be asked for together, again and again: their Gram matrix is made once for each noise."""
         self._listed, self._bank = tuple(terms), None
@@ -283,7 +288,13 @@ class Space:
 
     def white(self, columns: F64) -> F64:
         """(n, p) whitened columns."""
-        return self.whitener.whiten(columns)
+        if columns.ndim == 1 or columns.shape[1] <= TOGETHER:
+            return self.whitener.whiten(columns)
+        out = np.empty_like(columns)
+        for begin in range(0, columns.shape[1], TOGETHER):
+            few = slice(begin, begin + TOGETHER)
+            out[:, few] = self.whitener.whiten(columns[:, few])
+        return out
 
     def whitened(self, term: Term) -> F64:
         """(n, p) the term's columns, whitened."""

@@ -6,16 +6,17 @@ encoder, and the difference of the two would be the gyro's own noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_core.condense import Operator
 from calib_core.effects.base import Acts, Effect, Stage
 from calib_core.gap_search import equivalent_z
-from calib_core.gap_space import FEIGNED_STEPS, Space, Term
+from calib_core.gap_space import FEIGNED_STEPS, TOGETHER, Space, Term
 
 F64 = NDArray[np.float64]
 
@@ -52,10 +53,14 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
     own = own[: len(space.rows)]
     residual = space.white(space.residual)
     residual = residual - own @ (own.T @ residual)
-    for covariate, shapes in _shapes(space).items():
-        columns = _basis(space.over_rows(Acts.OUTPUT, shapes), space.base)
-        white = space.white(columns)
-        free = white - own @ (own.T @ white)
+    space.forget()
+    for covariate, shapes in _shapes(space):
+        columns = _basis(shapes, space.base)
+        del shapes
+        if not columns.shape[1]:
+            continue
+        free = space.white(columns)
+        _take_out(free, own)
         block = free.T @ free
         inverse = np.linalg.pinv(block, rcond=1e-6, hermitian=True)
         value = inverse @ (free.T @ residual)
@@ -67,23 +72,35 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
     return sorted(found, key=lambda s: -s.z)
 
 
-def _shapes(space: Space) -> dict[str, F64]:
-    """(k, p) shapes at the samples along each covariate that varies."""
+def _shapes(space: Space) -> Iterator[tuple[str, F64]]:
+    """(n, p) shapes over the rows along each covariate that varies, one covariate after the other."""
     c = space.covariates
-    shapes = {}
+
+    def over(shapes: F64 | Operator) -> F64:
+        return space.over_rows(Acts.OUTPUT, shapes)
+
     if np.ptp(c.position_deg) > 30.0:
-        angle = np.radians(c.position_deg)
-        waves = [f(k * angle) for k in HARMONICS for f in (np.sin, np.cos)]
-        shapes[f"{c.axis}_position_deg"] = np.column_stack([*waves, *_bumps(c.position_deg, 17).T])
+        yield f"{c.axis}_position_deg", _along_position(space)
     if np.ptp(c.rate_dps) > 10.0:
-        shapes[f"{c.axis}_rate_dps"] = _curved(_bumps(c.rate_dps, 21), np.linspace(-1.0, 1.0, 21))
+        bumps = _bumps(c.rate_dps, 21)
+        yield f"{c.axis}_rate_dps", over(bumps) @ _curved(bumps, np.linspace(-1.0, 1.0, 21))
     if c.temperature_c is not None and np.ptp(c.temperature_c) > 0.5:
-        shapes["temperature_c"] = _bumps(c.temperature_c, 10)
+        yield "temperature_c", over(_bumps(c.temperature_c, 10))
     if c.time_s[-1] > 20.0:
-        shapes["time_s"] = _bumps(c.time_s, 16)
+        yield "time_s", over(_bumps(c.time_s, 16))
     if np.any(np.diff(c.direction) != 0.0):
-        shapes["time_since_reversal_s"] = _since_reversal(c.direction, c.interval_s)
-    return shapes
+        yield "time_since_reversal_s", over(_since_reversal(c.direction, c.interval_s))
+
+
+def _along_position(space: Space) -> F64:
+    """(n, p) waves of the angle, and bumps along it."""
+    position = space.covariates.position_deg
+    angle, out = np.radians(position), np.empty((len(space.rows), 2 * len(HARMONICS) + 17))
+    for k in HARMONICS:
+        for j, wave in enumerate((np.sin, np.cos)):
+            out[:, [2 * (k - HARMONICS[0]) + j]] = space.over_rows(Acts.OUTPUT, wave(k * angle)[:, None])
+    out[:, 2 * len(HARMONICS) :] = space.over_rows(Acts.OUTPUT, _bumps(position, 17))
+    return out
 
 
 def _slack(space: Space, columns: F64) -> F64:
@@ -92,33 +109,55 @@ def _slack(space: Space, columns: F64) -> F64:
     if design.readings is None:
         return np.zeros(columns.shape[1])
     moving = space.rows.after >= 0
-    angle = np.cumsum(columns[moving] * space.rows.dt_s[moving, None], axis=0) / space.scale_factor
+    dt = space.rows.dt_s[moving]
     # Within a second or so: slower than that the encoder's codes average out.
-    span = max(2, round(1.0 / float(np.median(space.rows.dt_s[moving]))))
-    swing = angle[span:] - angle[:-span] if len(angle) > 2 * span else angle
-    return np.asarray((FEIGNED_STEPS * design.readings.step_deg) ** 2 / np.maximum(swing.var(axis=0) / 2.0, 1e-300))
+    span = max(2, round(1.0 / float(np.median(dt))))
+    slack = np.empty(columns.shape[1])
+    for k, column in enumerate(columns.T):
+        angle = np.cumsum(column[moving] * dt) / space.scale_factor
+        swing = angle[span:] - angle[:-span] if len(angle) > 2 * span else angle
+        slack[k] = (FEIGNED_STEPS * design.readings.step_deg) ** 2 / max(float(swing.var()) / 2.0, 1e-300)
+    return slack
 
 
 def _basis(columns: F64, base: F64) -> F64:
-    """Orthogonal columns that span what ``columns`` (n, p) add to ``base`` (n, b)."""
+    """(n, q) orthogonal columns that span what ``columns`` (n, p), which are used up, add to ``base`` (n, b)."""
     own, _ = np.linalg.qr(base)
-    free = columns - own @ (own.T @ columns)
-    span, power, _ = np.linalg.svd(free / np.sqrt((columns**2).sum(axis=0) + 1e-300), full_matrices=False)
-    return np.asarray(span[:, power > 1e-2 * power[0]])
+    size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    columns /= np.where(size > 0.0, size, 1.0)
+    for _ in range(2):  # rounding leaves a little the first time
+        _take_out(columns, own)
+    power, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = power > 1e-4 * power.max(initial=0.0)
+    return np.asarray(columns @ (vectors[:, kept] / np.sqrt(power[kept])))
 
 
-def _bumps(values: F64, count: int) -> F64:
-    """(k, count) triangles that sum to one, evenly spread over the values."""
-    centres, width = np.linspace(values.min(), values.max(), count, retstep=True)
-    return np.asarray(np.clip(1.0 - np.abs(values[:, None] - centres) / width, 0.0, 1.0))
+def _take_out(columns: F64, own: F64) -> None:
+    """Leaves of the columns (n, p), in place, what the orthonormal ``own`` (n, b) do not span."""
+    for begin in range(0, columns.shape[1], TOGETHER):
+        few = columns[:, begin : begin + TOGETHER]
+        few -= own @ (own.T @ few)
 
 
-def _curved(bumps: F64, centres: F64) -> F64:
-    """What the bumps can form that has no mean and no slope where the record was."""
-    occupied = bumps.sum(axis=0)
+def _bumps(values: F64, count: int) -> Operator:
+    """Sparse (k, count): triangles that sum to one, evenly spread over the values."""
+    from scipy.sparse import csr_array
+
+    place = (values - values.min()) * ((count - 1) / np.ptp(values))
+    left = np.clip(place.astype(np.int64), 0, count - 2)
+    k, share = np.arange(len(values)), place - left
+    at = (np.concatenate([k, k]), np.concatenate([left, left + 1]))
+    return csr_array((np.concatenate([1.0 - share, share]), at), shape=(len(values), count))
+
+
+def _curved(bumps: Operator, centres: F64) -> F64:
+    """(count, q) how bumps form what has no mean and no slope where the record was."""
+    occupied = np.asarray(bumps.sum(axis=0)).ravel()
     used = occupied > 20.0
     constraints = np.stack([occupied[used], occupied[used] * centres[used]])
-    return np.asarray(bumps[:, used] @ np.linalg.svd(constraints, full_matrices=True)[2][2:].T)
+    weights = np.zeros((len(centres), max(int(used.sum()) - 2, 0)))
+    weights[used] = np.linalg.svd(constraints, full_matrices=True)[2][2:].T
+    return weights
 
 
 def _since_reversal(direction: F64, interval_s: float) -> F64:

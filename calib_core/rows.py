@@ -7,6 +7,7 @@ per sample. Columns of effects are averaged over the same intervals by ``Average
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ SMOOTH_S = 0.05
 """Passes 7/8 of a motion at 4 Hz and a twentieth of the noise that the delay's column would have."""
 LEAST = 8
 """Samples below which nothing can be fitted."""
+SLAB = 100_000
+"""So many rows are formed at a time."""
 GAP = 2.5
 """A gap of more than this many sampling intervals interrupts the record."""
 
@@ -94,16 +97,31 @@ class Averages:
             self._cache[delay_s] = self._build(delay_s)
         return self._cache[delay_s]
 
+    def forget(self) -> None:
+        """Gives the operators' memory back."""
+        self._cache.clear()
+
     def _build(self, delay_s: float) -> tuple[Operator, Operator]:
+        from scipy.sparse import vstack
+
+        slope = _gradient(self.samples.time_s)
+        edges = [*range(0, len(self.at), SLAB), len(self.at)]
+        slabs = [self._slab(slice(a, b), delay_s, slope) for a, b in pairwise(edges)]
+        if len(slabs) == 1:
+            return slabs[0]
+        return vstack([s[0] for s in slabs], format="csr"), vstack([s[1] for s in slabs], format="csr")
+
+    def _slab(self, rows: slice, delay_s: float, slope: Operator) -> tuple[Operator, Operator]:
+        """Some of the rows."""
         from scipy.sparse import coo_array, diags_array
 
-        time, n, k = self.samples.time_s, len(self.at), len(self.samples.time_s)
-        single, between = np.flatnonzero(self.at >= 0), np.flatnonzero(self.at < 0)
-        slope = _gradient(time)
+        at, begin_s, end_s = self.at[rows], self.begin_s[rows], self.end_s[rows]
+        time, n, k = self.samples.time_s, len(at), len(self.samples.time_s)
+        single, between = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
         mean, tilt, change = _Entries(), _Entries(), _Entries()
-        mean.add(single, self.at[single], 1.0)
-        bounds, per_dt = [], 1.0 / (self.end_s - self.begin_s)[between]
-        for sign, moment in ((-1.0, self.begin_s), (1.0, self.end_s)):
+        mean.add(single, at[single], 1.0)
+        bounds, per_dt = [], 1.0 / (end_s - begin_s)[between]
+        for sign, moment in ((-1.0, begin_s), (1.0, end_s)):
             i = np.clip(np.searchsorted(time, moment[between] + delay_s, side="right") - 1, 0, k - 2)
             h = time[i + 1] - time[i]
             u = (moment[between] + delay_s - time[i]) / h
@@ -119,7 +137,7 @@ class Averages:
         _cubic(mean, tilt, between[row], piece, np.ones(len(row)), h * per_dt[row], h)
         shape = (n, k)
         steep = coo_array(change.coordinates, shape=shape).tocsr()
-        steep += diags_array(np.where(self.at >= 0, 1.0, 0.0)) @ slope[np.maximum(self.at, 0)]
+        steep += diags_array(np.where(at >= 0, 1.0, 0.0)) @ slope[np.maximum(at, 0)]
         level, lean = (coo_array(e.coordinates, shape=shape).tocsr() for e in (mean, tilt))
         return level + lean @ slope, steep
 
