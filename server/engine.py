@@ -201,13 +201,14 @@ def _run(
                 **stamp(), state=state.name, index=index, axis=state.axis, kind=state.kind, readings=state.readings,
                 duration_s=state.duration_s,
             )  # fmt: skip
-            done, done_s = 0, 0.0
+            done, done_s, segment = 0, 0.0, "rest"
             for step in state.steps:
-                yield from (
-                    Rows(**stamp(), state=state.name, segment="rest", columns=block.columns,
+                yield from (  # on a busy computer the end of a stroke comes late: it belongs to its stroke
+                    Rows(**stamp(), state=state.name, segment=segment, columns=block.columns,
                          progress=_progress(plan, state, before_s, done_s, done))
                     for block in rig.waiting()
                 )  # fmt: skip
+                segment = step.segment
                 if abort.is_set():
                     raise Aborted
                 rig.heat(step.heater)

@@ -60,6 +60,17 @@ def moving_in(state: str) -> Callable[[Document], bool]:
     return lambda d: isinstance(d, Rows) and d.state == state and d.segment.startswith(f"{kind}_{axis}")
 
 
+def test_what_a_busy_computer_reads_late_belongs_to_the_stroke_that_it_is_the_end_of() -> None:
+    rig = Watched()
+    rig.twin_daq.waiting = lambda: 300  # type: ignore[method-assign]
+    blocks = [d for d in run(short("rate_x"), rig) if isinstance(d, Rows)]
+    strokes = [list(of_one) for _, of_one in itertools.groupby(blocks, key=lambda d: d.segment)]
+    assert strokes[0][0].segment == "rest"  # nothing came before it
+    ends = [stroke[-1] for stroke in strokes if stroke[0].segment.startswith("rate_x/")]
+    assert len(ends) > 30
+    assert {len(end.columns["time_s"]) for end in ends} == {30}
+
+
 def test_a_run_is_start_descriptor_states_with_rows_and_stop() -> None:
     plan = short("estimate_x", "rate_z")
     documents = list(run(plan, open_rig("twin:?seed=1"), run_id="r1", header={"operator": "A"}, clock=lambda: 7.0))

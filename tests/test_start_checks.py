@@ -137,6 +137,18 @@ def test_readings_that_come_too_seldom_are_told_with_the_latency_timer_as_cure()
     assert "latency" in render(found["servo x"].cure, {})
 
 
+def test_readings_that_a_busy_computer_was_late_for_are_not_blamed_on_the_adapter() -> None:
+    made = rig()
+    read = made.table.read
+    made.table.read = lambda: {
+        axis: replace(seen, time_s=seen.time_s[::2], angle_deg=seen.angle_deg[::2], late=len(seen.time_s) // 2)
+        for axis, seen in read().items()
+    }
+    found = checked(made)
+    assert found["servo x"].code == "check.host_busy"
+    assert "computer" in render(found["servo x"].code, found["servo x"].values)
+
+
 def test_a_daq_that_is_gone_ends_the_checks() -> None:
     made = rig()
     made.daq.unplugged = True

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import sys
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -25,6 +26,8 @@ def shown(here: Services, lang: str) -> dict[str, Any]:
     status = bench.rig or {}
     found = ports()
     choices = [{"url": "twin:", "label": texts.render("rig.choice.twin", {}, lang)}]
+    if sys.platform != "win32":
+        choices.append({"url": "emulated:", "label": texts.render("rig.choice.emulated", {}, lang)})
     for port in found:
         url = f"dynamixel:{port}?ids=1,2&baud=1000000+nidaq:Dev1?channels=ai0,ai1"
         choices.append({"url": url, "label": texts.render("rig.choice.port", {"port": port}, lang)})

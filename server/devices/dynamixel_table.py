@@ -101,6 +101,7 @@ class _Servo:
     seen_s: float = -math.inf
     heard_s: float = -math.inf  # also by replies whose time is not known
     missed: int = 0
+    late: int = 0
     wild: int = 0
     course: _Course | None = None
     readings: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=KEEP))
@@ -187,7 +188,8 @@ class DynamixelTable:
             for axis, servo in self._servos.items():
                 pairs = np.array(servo.readings).reshape(-1, 2)
                 servo.readings.clear()
-                taken[axis] = Readings(pairs[:, 0], pairs[:, 1], servo.heard_s)
+                taken[axis] = Readings(pairs[:, 0], pairs[:, 1], servo.heard_s, servo.late)
+                servo.late = 0
             return taken
 
     def telemetry(self) -> dict[str, Telemetry]:
@@ -409,6 +411,7 @@ class DynamixelTable:
         now = clock()
         if no.why == "unstamped":
             servo.heard_s = now
+            servo.late += 1
         if servo.missed > MISSES and (now - servo.heard_s > SILENT_S or now - servo.seen_s > BUSY_S):
             raise self._silent(axis, no)
 

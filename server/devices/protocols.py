@@ -22,12 +22,14 @@ F64 = NDArray[np.float64]
 class Readings:
     """Encoder readings of one axis: times (m,) by the host's clock at the middle of each transaction, angles (m,).
 
-    `heard_s`: when it last answered at all, also too late for the reading's time to be known.
+    `heard_s`: when it last answered at all, also too late for the reading's time to be known; `late`: how many such
+    answers there were.
     """
 
     time_s: F64
     angle_deg: F64
     heard_s: float = -np.inf
+    late: int = 0
 
 
 @dataclass(frozen=True)

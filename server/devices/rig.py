@@ -52,6 +52,7 @@ class _Shaft:
     seen_s: float = -np.inf
     seen_deg: float = np.nan
     heard_s: float = -np.inf
+    late: int = 0  # answers that came too late to be timed
     low_V: float = np.inf
     high_V: float = -np.inf
     felt: bool = False
@@ -131,6 +132,10 @@ class Rig:
         gyros = [name for name in self.daq.channels if name.endswith("_gyro_v")]
         delays = {f"{name[0]}_gyro_delay_s": f"{i * self.daq.channel_delay_s:g}" for i, name in enumerate(gyros) if i}
         return {"rig": self.url, "gyro_average_s": f"{ROW_S:g}", **delays}
+
+    def late(self, axis: str) -> int:
+        """Answers of this axis' servo since `begin` that came too late to be timed."""
+        return self._shafts[axis].late
 
     @property
     def clock_facts(self) -> dict[str, str]:
@@ -261,6 +266,7 @@ class Rig:
         for axis, shaft in self._shafts.items():
             read = readings[axis]
             shaft.take(self.clock.to_daq(read.time_s) + self._one_way_s, read.angle_deg)
+            shaft.late += read.late
             shaft.heard_s = max(shaft.seen_s, float(self.clock.to_daq(np.array([read.heard_s]))[0]))
             angle, at = shaft.rows(float(time_s[0]) - ROW_S / 2, n)
             columns[f"{axis}_position_deg"], columns[f"{axis}_position_time_s"] = angle, at

@@ -69,12 +69,17 @@ def run(rig: Rig, gyro_model: GyroModel, *, plan: Plan | None = None, abort: Abo
 
 def answering(rig: Rig, abort: Abort) -> Iterator[Check]:
     """Both servos read often enough, and samples from the DAQ. Nothing moves."""
+    before = {axis: rig.late(axis) for axis in rig.axes}
     rows = _Bench(rig, abort).go((), 1.0)
     telemetry = rig.table.telemetry()
     for axis, can in rig.axes.items():
         per_s = float(np.isfinite(rows[f"{axis}_position_deg"]).mean()) / ROW_S
-        values = {"part": can.part, "axis": axis, "per_s": per_s, "least": READINGS_HZ, **vars(telemetry[axis])}
-        if per_s < READINGS_HZ:
+        late = rig.late(axis) - before[axis]
+        values = {"part": can.part, "axis": axis, "per_s": per_s, "least": READINGS_HZ, "late": late}
+        values |= vars(telemetry[axis])
+        if per_s < READINGS_HZ <= per_s + late / (ROW_S * len(rows["time_s"])):
+            yield Check(f"servo {axis}", False, "check.host_busy", values, "cure.host_busy")
+        elif per_s < READINGS_HZ:
             yield Check(f"servo {axis}", False, "check.servo_slow", values, "cure.servo_slow")
         else:
             yield Check(f"servo {axis}", True, "check.servo", values)
@@ -220,6 +225,7 @@ class _Bench:
             blocks.append(self.rig.read(BLOCK_S).columns)
             if axis:
                 load.append(self.rig.table.telemetry()[axis].load_pct)
+        blocks += [block.columns for block in self.rig.waiting()]  # a busy computer is behind: see the motion's end
         return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}, np.array(load)
 
     def home(self) -> None:
