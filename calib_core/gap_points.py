@@ -260,7 +260,7 @@ def _search(
         bought = field[best] >= SHARE * len(readings.gyro) * np.log(first / readings.fit(chosen).squares)
         judged = readings.at_other_places if gains else readings.held_out
         holds = judged([*chosen, column]) < judged(chosen)
-        if field[best] < _null_tail(readings.own(free, chosen), rng) ** 2 or not (bought and holds):
+        if field[best] < null_tail(readings.own(free, chosen), rng) ** 2 or not (bought and holds):
             return chosen, gains
         chosen.append(column)
         gains.append(field[best])
@@ -281,7 +281,7 @@ def _gains(readings: Readings, columns: Sequence[Column], chosen: Sequence[Colum
     return gains
 
 
-def _null_tail(own: F64, rng: np.random.Generator) -> float:
+def null_tail(own: F64, rng: np.random.Generator) -> float:
     """The quantile of the greatest |z| over all columns where nothing is missing (max-T)."""
     seen = own[:, np.isfinite(own).all(axis=0)]
     power, vectors = np.linalg.eigh(seen.T @ seen)

@@ -208,7 +208,7 @@ def failing(failure: Mapping[str, Any]) -> Words:
     low, high = failure["from"], failure["to"]
     finest = (high - low) / 5.0
     ends = {"from": rounded(low, finest), "to": rounded(high, finest)}
-    place = _covariate(failure["covariate"])
+    place = placed(failure["covariate"])
     kind = place.pop("kind")
     if max(abs(low), abs(high)) < STILL.get(kind, 0.0):
         kind = "other_still" if kind == "other_rate" else "still"
@@ -307,11 +307,12 @@ def _joined(joint: str, words: Sequence[object]) -> Any:
 
 def along(covariate: str) -> Words:
     """A covariate in words."""
-    place = _covariate(covariate)
+    place = placed(covariate)
     return {"code": f"diagnosis.along.{place.pop('kind')}", "values": place}
 
 
-def _covariate(name: str) -> Words:
+def placed(name: str) -> Words:
+    """Its kind, which a text is named after, and what the text is filled with."""
     kind = next((kind for ending, kind in KINDS.items() if name.endswith(ending)), "other")
     return {"kind": kind, "axis": name[0], "covariate": name}
 

@@ -59,6 +59,10 @@ EXAMPLES = {
 }  # fmt: skip
 
 
+THESIS = {"thesis_rate": "rate", "thesis_position": "position"}
+"""The thesis' own readings, as they are printed."""
+
+
 def by_board(board: str) -> Example | None:
     return next((example for example in EXAMPLES.values() if example.board == board), None)
 
@@ -80,10 +84,10 @@ def record(example: Example) -> "Recording":
 
 def kept(store: "Store", name: str) -> str | None:
     """The stored recording of an example, where it was made before."""
-    if name not in EXAMPLES:
-        raise Problem("example.not_found", given=name, allowed=", ".join(EXAMPLES))
-    found, _ = store.recordings.find(board=EXAMPLES[name].board)
-    return next((str(row["id"]) for row in found if row["source"] == "example"), None)
+    if name not in (*EXAMPLES, *THESIS):
+        raise Problem("example.not_found", given=name, allowed=", ".join((*EXAMPLES, *THESIS)))
+    found, _ = store.recordings.find(q=name, limit=200)
+    return next((str(row["id"]) for row in found if row["source"] == "example" and row["name"] == name), None)
 
 
 def made(store: "Store", name: str) -> str:
@@ -91,6 +95,10 @@ def made(store: "Store", name: str) -> str:
     there = kept(store, name)
     if there is not None:
         return there
+    if name in THESIS:
+        from calib_core.thesis.printed import every_reading
+
+        return store.recordings.add_points(every_reading(THESIS[name]), board="", name=name, source="example")
     example = EXAMPLES[name]
     store.boards.ensure(example.board)
     return store.recordings.add(record(example), board=example.board, name=name, source="example")

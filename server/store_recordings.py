@@ -40,13 +40,13 @@ class Recordings:
             self.seal(recording, whole)
         return recording
 
-    def add_points(self, points: Points, *, board: str, name: str) -> str:
+    def add_points(self, points: Points, *, board: str, name: str, source: str = "upload") -> str:
         """Independent readings (``gyro-points 1``), kept as the text that they are written as."""
         text = io.BytesIO()
         write(points, text)
         raw = text.getvalue()
         with self._at.write() as db:
-            recording = self.create(board=board, name=name, source="upload", header={"format": FORMAT})
+            recording = self.create(board=board, name=name, source=source, header={"format": FORMAT})
             block = {"recording": recording, "kind": "points", "state": "", "live": 0, "samples": len(points)}
             db.table("blocks").insert({**block, "end_s": 0.0, "data": zlib.compress(raw)})
             facts = {"digest": hashlib.sha256(raw).hexdigest(), "samples": len(points)}

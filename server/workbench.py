@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib_core.problem import Problem
-from server import diagnosis
+from server import diagnosis, workbench_points
 from server.live import encode
 from server.texts import render, texts
 
 if TYPE_CHECKING:
+    from calib_core.points import Points
     from calib_core.workbench import Model, Workbench
 
 Words = dict[str, Any]
@@ -26,7 +27,7 @@ WARM = 3
 """So many recordings stay ready; one of 22 000 samples takes some 40 MB."""
 PATH_HZ = 25.0
 """Fine enough to draw a motion of 4 Hz."""
-_warm: OrderedDict[tuple[Path, str, str], Workbench] = OrderedDict()
+_warm: OrderedDict[tuple[Path, str, str, int], Workbench] = OrderedDict()
 
 
 def warm(data: Path, recording: str, axis: str) -> Workbench:
@@ -34,10 +35,11 @@ def warm(data: Path, recording: str, axis: str) -> Workbench:
     from calib_core.workbench import Workbench
     from server.store import Store
 
-    key = (data, recording, axis)
-    if key not in _warm:
-        with Store(data) as store:
-            loaded = store.recording(recording)
+    with Store(data) as store:
+        # A run that is still on has more samples each time.
+        key = (data, recording, axis, store.recordings.row(recording)["samples"])
+        loaded = None if key in _warm else store.recording(recording)
+    if loaded is not None:
         if axis not in loaded.axes:
             raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(loaded.axes))
         _warm[key] = Workbench(loaded, axis)
@@ -47,13 +49,17 @@ def warm(data: Path, recording: str, axis: str) -> Workbench:
     return _warm[key]
 
 
-def signal(data: Path, recording: str, axis: str | None, points: int) -> bytes:
+def signal(data: Path, recording: str, axis: str | None, board: str, points: int) -> bytes:
     """The measured output alone, for the first picture: no arithmetic beyond picking what a screen shows."""
-    from calib_core.workbench import decimated
+    from calib_core.pictures import decimated
     from server.store import Store
 
     with Store(data) as store:
-        loaded = store.recording(recording)
+        readings = store.recordings.points(recording)
+        loaded = store.recording(recording) if readings is None else None
+    if readings is not None:
+        return workbench_points.signal(readings, axis, board)
+    assert loaded is not None
     named = loaded.header.get("axis", "")
     axis = axis or (named if named in loaded.axes else loaded.axes[0])
     if axis not in loaded.axes:
@@ -76,12 +82,16 @@ def fit(
     formulas: Sequence[Mapping[str, str]],
     window: tuple[float | None, float | None],
     points: int,
+    board: str,
     lang: str,
 ) -> bytes:
     """Base and effects on a recording, with everything that a page draws of it."""
     from calib_core import formula
-    from calib_core.workbench import decimated, spectrum, stretches
+    from calib_core.pictures import decimated, spectrum, stretches
 
+    readings = _readings(data, recording)
+    if readings is not None:
+        return workbench_points.fit(readings, axis, board, effects, formulas, lang)
     bench = warm(data, recording, axis)
     for own in formulas:
         bench.own(formula.from_json(own))
@@ -110,33 +120,63 @@ def fit(
         "whole": len(at) == inside.stop - inside.start, "error": _error(model),
         "steps": [_error(bench.fit(model.effects[:k]))["held_out"] for k in range(len(model.effects) + 1)],
         "parameters": model.parameters, "failures": _failures(model, lang),
-        "along": [{"kind": _kind(n), **diagnosis.along(n)["values"]} for n in along],
+        "along": [diagnosis.placed(n) for n in along],
         "white_density": noise.white / scale * float(np.sqrt(2.0 * samples.interval_s)),
     }  # fmt: skip
     return encode(diagnosis.plain(head), arrays)
 
 
-def suspects(data: Path, recording: str, axis: str, effects: Sequence[str], lang: str) -> Words:
+def suspects(data: Path, recording: str, axis: str, effects: Sequence[str], board: str, lang: str) -> Words:
     """The verdict on the base, and every effect of the library with its evidence beside ``effects``."""
     from calib_core.gap_report import to_json
 
+    readings = _readings(data, recording)
+    if readings is not None:
+        found, threshold, possible = workbench_points.suspects(readings, axis, board, effects, lang)
+        rows = {row["effect"]: {**row, "z": _z(row)} for row in found["candidates"]}
+        return _listed(found, rows, found["rivals"], threshold, effects, possible, lang)
     bench = warm(data, recording, axis)
     answer = diagnosis.told(diagnosis.explained(to_json(bench.diagnosis)), lang)
     threshold = bench.diagnosis.search.threshold if bench.diagnosis.search else float("inf")
     rows = {row["effect"]: {**row, "z": _z(row)} for row in answer["candidates"]}
     ties = _beside(bench, effects, rows, threshold) if effects else _found(answer, rows)
+    return _listed(answer, rows, ties, threshold, effects, bench.effects, lang)
+
+
+def _listed(
+    answer: Words,
+    rows: dict[str, Words],
+    ties: Sequence[Sequence[str]],
+    threshold: float,
+    effects: Sequence[str],
+    possible: Sequence[str],
+    lang: str,
+) -> Words:
+    """The verdict and the rows, the surest first, each with its sentence."""
     for name in effects:
         rows.setdefault(name, {"effect": name, "status": "tested", "two_delta_lnL": None, "p": None, "z": None})
     tested = sum(row["status"] == "tested" for row in rows.values())
     for name, row in rows.items():
         row["tie"] = next((k for k, names in enumerate(ties) if name in names), None)
-        row["in_model"], row["can_be_added"] = name in effects, name in bench.effects
+        row["in_model"], row["can_be_added"] = name in effects, name in possible
         row |= _evidence(row, threshold, tested)
         row["sentence"] = render(row["code"], row["values"], lang)
         row["title"] = texts(lang).get(f"effects.{name}.name", name)
-    order = sorted(rows.values(), key=lambda r: (r["status"] != "tested", -(r["z"] or 0.0), r["effect"]))
+    order = sorted(
+        rows.values(), key=lambda r: (not r["in_model"], r["status"] != "tested", -(r["z"] or 0.0), r["effect"])
+    )
+    if effects:
+        answer = answer | _beside_said(order, lang)
     verdict = {key: answer[key] for key in ("verdict", "sentence", "code", "values", "checks", "limits", "unknown")}
     return dict(diagnosis.plain({**verdict, "threshold": threshold, "suspects": order}))
+
+
+def _beside_said(order: Sequence[Words], lang: str) -> Words:
+    """What is to be said of a model with effects: whether anything stands out beside it."""
+    names = [row["effect"] for row in order if row["word"] in ("certain", "likely", "probable")]
+    code = "workbench.beside.something" if names else "workbench.beside.nothing"
+    values = {"effects": diagnosis.effect_words(names[:3])} if names else {}
+    return {"code": code, "values": values, "sentence": render(code, values, lang)}
 
 
 def _found(answer: Words, rows: dict[str, Words]) -> list[list[str]]:
@@ -166,6 +206,13 @@ def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], th
     best = max((row["two_delta_lnL"] for row in over), default=0.0)
     tied = [row["effect"] for row in over if best - row["two_delta_lnL"] < RIVAL]
     return [tied] if len(tied) > 1 else []
+
+
+def _readings(data: Path, recording: str) -> Points | None:
+    from server.store import Store
+
+    with Store(data) as store:
+        return store.recordings.points(recording)
 
 
 def path(motion: Sequence[Mapping[str, Any]]) -> Words:
@@ -208,10 +255,6 @@ def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
     else:
         word = "nothing"
     return {"word": word, "code": f"workbench.evidence.{word}", "values": {}}
-
-
-def _kind(name: str) -> str:
-    return next((kind for ending, kind in diagnosis.KINDS.items() if name.endswith(ending)), "other")
 
 
 def _error(model: Model) -> Words:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calib_core.gyro_models import PRESETS
+from calib_core.pictures import decimated, spectrum
 from calib_core.problem import Problem
-from calib_core.workbench import decimated, spectrum
 from server import examples, workbench
 from server.devices import open_rig
 from server.live import decode
@@ -36,7 +36,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, st
 
 def fit(stored: tuple[Path, dict[str, str]], name: str, *effects: str, formulas: tuple[Any, ...] = ()) -> Any:
     data, ids = stored
-    return decode(workbench.fit(data, ids[name], "x", effects, formulas, FULL, 4000, "en"))
+    return decode(workbench.fit(data, ids[name], "x", effects, formulas, FULL, 4000, "", "en"))
 
 
 def test_an_effect_is_fitted_in_a_third_of_a_second_on_22_000_samples(stored: tuple[Path, dict[str, str]]) -> None:
@@ -96,7 +96,7 @@ def test_failing_stretches_come_with_their_pictures_and_are_gone_with_the_cause(
 
 def test_a_stretch_is_shown_with_every_sample(stored: tuple[Path, dict[str, str]]) -> None:
     data, ids = stored
-    head, columns = decode(workbench.fit(data, ids["clipped"], "x", (), (), (20.0, 25.0), 1000, "en"))
+    head, columns = decode(workbench.fit(data, ids["clipped"], "x", (), (), (20.0, 25.0), 1000, "", "en"))
     assert head["whole"]
     assert (columns["time_s"][0], columns["time_s"][-1]) == pytest.approx((20.0, 25.0), abs=0.011)
     assert len(columns["time_s"]) in range(499, 503)
@@ -104,7 +104,7 @@ def test_a_stretch_is_shown_with_every_sample(stored: tuple[Path, dict[str, str]
 
 def test_rivals_share_a_tie_and_what_cannot_be_tested_says_so(stored: tuple[Path, dict[str, str]]) -> None:
     data, ids = stored
-    answer = workbench.suspects(data, ids["one_sine"], "x", (), "en")
+    answer = workbench.suspects(data, ids["one_sine"], "x", (), "", "en")
     rows = {row["effect"]: row for row in answer["suspects"]}
     assert len(rows) == 27
     assert answer["verdict"] == "ambiguous"
@@ -115,7 +115,7 @@ def test_rivals_share_a_tie_and_what_cannot_be_tested_says_so(stored: tuple[Path
     assert not rows["bias_temperature"]["can_be_added"]
     beside = {
         row["effect"]: row
-        for row in workbench.suspects(data, ids["one_sine"], "x", ("bandwidth_lag",), "en")["suspects"]
+        for row in workbench.suspects(data, ids["one_sine"], "x", ("bandwidth_lag",), "", "en")["suspects"]
     }
     assert beside["bandwidth_lag"]["word"] == "in_model"
     assert beside["time_offset"]["word"] in ("nothing", "spanned")
@@ -154,6 +154,25 @@ def test_an_example_board_is_the_same_gyro_on_any_simulated_rig() -> None:
     assert not rig.table.plant.models["x"].effects
 
 
+def test_the_thesis_own_readings_are_tried_like_a_recording(stored: tuple[Path, dict[str, str]]) -> None:
+    data, _ = stored
+    with Store(data) as store:
+        made = examples.made(store, "thesis_rate")
+    head, _ = decode(workbench.signal(data, made, "x", "", 4000))
+    board = head["board"]
+    assert (head["points"], head["unit"], len(head["axes"])) == ("rate", "deg/s", 4)
+    answer = decode(
+        workbench.fit(data, made, "x", ("scale_factor_cubic", "scale_factor_asymmetry"), (), FULL, 4000, board, "en")
+    )
+    base, cubic, both = answer[0]["steps"]
+    assert cubic < 0.9 * base
+    assert both > 0.95 * cubic
+    assert len(answer[1]["residual"]) == answer[0]["samples"] == 168
+    rows = {row["effect"]: row for row in workbench.suspects(data, made, "x", (), board, "en")["suspects"]}
+    assert rows["scale_factor_cubic"]["word"] in ("certain", "likely")
+    assert rows["bias_drift"]["word"] == "no_data"
+
+
 def test_decimation_keeps_every_extreme() -> None:
     values = np.sin(np.arange(10_000) / 7.0)
     values[[1234, 8765]] = 9.0, -9.0
@@ -175,4 +194,4 @@ def test_a_line_and_white_noise_stand_in_the_spectrum_as_they_are() -> None:
 def test_a_recording_without_the_axis_is_refused(stored: tuple[Path, dict[str, str]]) -> None:
     data, ids = stored
     with pytest.raises(Problem, match=r"diagnosis\.no_axis"):
-        workbench.fit(data, ids["one_sine"], "y", (), (), FULL, 4000, "en")
+        workbench.fit(data, ids["one_sine"], "y", (), (), FULL, 4000, "", "en")

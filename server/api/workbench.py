@@ -19,6 +19,7 @@ BINARY: dict[int | str, dict[str, Any]] = {200: {"content": {COLUMNS: {}}}}
 AxisName = Literal["x", "y", "z"]
 Points = Annotated[int, Field(ge=100, le=50_000, description="at most so many instants of the signal")]
 EffectName = Annotated[str, Field(min_length=1, max_length=64)]
+Board = Annotated[str, Query(max_length=64, description="of readings of several boards: which")]
 Seconds = Annotated[float, Field(ge=-1e9, le=1e9)]
 
 
@@ -39,6 +40,7 @@ class FitBody(Body):
     begin_s: Seconds | None = Field(None, description="show the signal from here, in seconds from its first sample")
     end_s: Seconds | None = None
     points: Points = 4000
+    board: Annotated[str, Field(max_length=64)] = Field("", description="of readings of several boards: which")
 
 
 class Suspect(Answer):
@@ -91,10 +93,11 @@ def signal(
     recording: str,
     here: Here,
     axis: AxisName | None = None,
+    board: Board = "",
     points: Annotated[int, Query(ge=100, le=50_000)] = 4000,
 ) -> Response:
     here.store.recordings.row(recording)
-    return Response(workbench.signal(here.store.data, recording, axis, points), media_type=COLUMNS)
+    return Response(workbench.signal(here.store.data, recording, axis, board, points), media_type=COLUMNS)
 
 
 @router.post(
@@ -108,7 +111,16 @@ async def fit(recording: str, body: FitBody, here: Here, lang: Language) -> Resp
     formulas = [formula.model_dump() for formula in body.formulas]
     window = (body.begin_s, body.end_s)
     columns = await here.compute.run(
-        workbench.fit, here.store.data, recording, body.axis, tuple(body.effects), formulas, window, body.points, lang
+        workbench.fit,
+        here.store.data,
+        recording,
+        body.axis,
+        tuple(body.effects),
+        formulas,
+        window,
+        body.points,
+        body.board,
+        lang,
     )
     return Response(columns, media_type=COLUMNS)
 
@@ -124,10 +136,11 @@ async def suspects(
     here: Here,
     lang: Language,
     effects: Annotated[str, Query(max_length=1000, description="names, with commas between them")] = "",
+    board: Board = "",
 ) -> Suspects:
     here.store.recordings.row(recording)
     names = tuple(filter(None, effects.split(",")))
-    answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, lang)
+    answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, board, lang)
     return Suspects.model_validate(answer)
 
 
@@ -138,7 +151,7 @@ def motion(experiment: str, here: Here) -> Path:
 
 @router.get("/examples", summary="Recordings to learn on")
 def found(here: Here, lang: Language) -> Examples:
-    return Examples(items=[_shown(here, name, lang) for name in examples.EXAMPLES])
+    return Examples(items=[_shown(here, name, lang) for name in (*examples.EXAMPLES, *examples.THESIS)])
 
 
 @router.post("/examples/{name}", status_code=201, summary="Make an example's recording", responses=declared(404))
@@ -149,6 +162,6 @@ async def make(name: str, here: Here, lang: Language) -> Example:
 
 def _shown(here: Here, name: str, lang: str) -> Example:
     title, story = (render(f"example.{name}.{part}", {}, lang) for part in ("title", "story"))
-    axis = examples.EXAMPLES[name].axis
+    axis = examples.EXAMPLES[name].axis if name in examples.EXAMPLES else "x"
     kept = examples.kept(here.store, name)
     return Example.model_validate({"name": name, "title": title, "story": story, "axis": axis, "recording": kept})

@@ -24,12 +24,14 @@ page("workbench", async (main) => {
   const recording = asked.get("recording");
   if (!recording) return choose(main, carried);
   // Shown as soon as there is something to see; the fit comes into its own places.
-  const [signal, row] = await Promise.all([api.signal(recording, { axis: asked.get("axis") }), api.recording(recording)]);
+  const [signal, row] = await Promise.all([api.signal(recording, { axis: asked.get("axis"), board: asked.get("board") }), api.recording(recording)]);
   return open(main, recording, row, signal);
 });
 
 async function open(main, recording, row, signal) {
   const { axis, unit } = signal;
+  // Independent readings may be of several boards.
+  const board = signal.points ? signal.board : null;
   const book = notebook();
   const cards = new Map();
   const own = new Map();
@@ -48,8 +50,11 @@ async function open(main, recording, row, signal) {
 
   main.append(
     h("header", { class: "row spread opened" },
-      h("p", {}, h("strong", {}, name), ` · ${t("workbench.axis", { axis })} · ${signal.samples.toLocaleString("en").replaceAll(",", " ")} ${t("workbench.samples")} · ${duration(signal.duration_s)}`),
-      h("div", { class: "row" }, signal.axes.length > 1 ? h("nav", { class: "row axes", "aria-label": t("workbench.axes") }, signal.axes.map((one) => h("a", { class: "button", href: links.workbench(recording, one, carried), "aria-current": one === axis ? "page" : null }, one))) : null,
+      h("p", {}, h("strong", {}, name), ` · ${[board && t("workbench.board", { board }), t("workbench.axis", { axis }), extent(signal)].filter(Boolean).join(" · ")}`),
+      h("div", { class: "row" }, signal.axes.length > 1 ? h("nav", { class: "row axes", "aria-label": t("workbench.axes") }, signal.axes.map((one) => [one].flat()).map((pair) => h("a", {
+        class: "button", href: links.workbench(recording, pair.at(-1), { ...(pair[1] && { board: pair[0] }), ...carried }),
+        "aria-current": pair.at(-1) === axis && (!pair[1] || pair[0] === board) ? "page" : null,
+      }, pair.join(" ")))) : null,
         carried.lab ? h("a", { class: "button", href: links.lab(carried.lab) }, t("workbench.back_to_lab")) : h("a", { class: "button", href: "/workbench.html" }, t("workbench.another"))), error),
     seen, h("aside", { class: "beside", "aria-label": t("workbench.error") }, side), h("div", { class: "evidence-row" }, listed, h("div", { class: "stack" }, cardPlace, formulaForm(addOwn))), h("div", { class: "columns of-model" }, nextPlace, h("div", { class: "stack" }, keepPlace, bookPlace)));
 
@@ -60,12 +65,12 @@ async function open(main, recording, row, signal) {
   let guess = null;
   let form = null;
   let busy = false;
-  const draw = pictures(seen, { unit, detail: ([begin_s, end_s]) => fit(history[at].effects, { begin_s, end_s }), pointed: (along) => form?.point(along) });
+  const draw = pictures(seen, { unit, points: signal.points, detail: ([begin_s, end_s]) => fit(history[at].effects, { begin_s, end_s }), pointed: (along) => form?.point(along) });
   const bench = ledger(side, { undo: () => change(history[at].effects.slice(0, -1)), compare });
   draw.signal(signal);
   performance.mark("first-plot");
 
-  const fit = (effects, part = {}) => api.fit(recording, { axis, effects, formulas: effects.filter((name) => own.has(name)).map((name) => own.get(name)), ...part });
+  const fit = (effects, part = {}) => api.fit(recording, { axis, ...(board && { board }), effects, formulas: effects.filter((name) => own.has(name)).map((name) => own.get(name)), ...part });
 
   /** Another model: from what was tried before, or fitted now. */
   async function change(effects) {
@@ -86,7 +91,7 @@ async function open(main, recording, row, signal) {
         const { held_out: after, floor, unit: of } = history[at].error;
         book.write({ step: more ? "added" : "removed", effects: changed, before: before.error.held_out, after, floor, unit: of });
       }
-      answer = await api.suspects(recording, { axis, effects });
+      answer = await api.suspects(recording, { axis, board, effects });
       refresh();
     } catch (problem) {
       if (before && problem.code?.startsWith("formula.")) throw problem;
@@ -127,7 +132,7 @@ async function open(main, recording, row, signal) {
     }
     form = null;
     verdict.textContent = answer.sentence;
-    showSuspects(suspectsPlace, answer, { open: show, guess, decide, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
+    showSuspects(suspectsPlace, answer, { open: show, guess, decide: signal.points ? null : decide, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
     if (!cardPlace.querySelector("h2")) show(answer.suspects[0].effect, false);
   }
 
@@ -175,7 +180,9 @@ async function open(main, recording, row, signal) {
     nextPlace.scrollIntoView({ block: "nearest" });
     next.propose();
   }
-  keepPanel(keepPlace, { ask: current });
+  // Readings without a time have no motion to go on with, and no model that could correct a signal.
+  nextPlace.hidden = keepPlace.hidden = Boolean(signal.points);
+  keepPanel(keepPlace, { ask: current, isSession: ["run", "upload"].includes(row.source) });
   book.panel(bookPlace);
 
   // The page is there; numbers come into their places.
@@ -187,4 +194,10 @@ async function open(main, recording, row, signal) {
       if (answer && !isGuessing.checked) book.write({ step: "verdict", code: answer.code, values: answer.values });
     } catch (problem) { say(error, problem); }
   })();
+}
+
+/** How much there is of it: samples and seconds, or readings. */
+function extent({ points, samples, duration_s }) {
+  if (points) return t("workbench.points", { count: samples });
+  return `${samples.toLocaleString("en").replaceAll(",", " ")} ${t("workbench.samples")} · ${duration(duration_s)}`;
 }

@@ -4,8 +4,9 @@ import { api, links } from "../api.js";
 import { h, say } from "../dom.js";
 import { t } from "../text.js";
 
-/** ask() gives {recording, axis, effects} as they are now, after storing formulas of the student's own. */
-export function keepPanel(place, { ask }) {
+/** ask() gives {recording, axis, effects} as they are now, after storing formulas of the student's own;
+ * isSession: whether the recording may hold the six states that a certificate is made from. */
+export function keepPanel(place, { ask, isSession }) {
   const name = h("input", { id: "model-name", required: true, maxlength: "100", autocomplete: "off" });
   const error = h("p", { class: "error", role: "alert" });
   const told = h("div", { class: "stack", "aria-live": "polite" });
@@ -19,7 +20,7 @@ export function keepPanel(place, { ask }) {
       told.replaceChildren(h("p", {}, t("workbench.keep.kept", { name: model.name })),
         h("div", { class: "row" },
           ["json", "h", "py"].map((kind) => h("a", { class: "button", href: links.model(model.id, kind), download: "" }, t(`workbench.keep.${kind}`))),
-          certify(model)));
+          isSession ? certify(model) : null));
     } catch (problem) { say(error, problem); }
   }
 

@@ -5,21 +5,22 @@ import { h } from "../dom.js";
 import { t } from "../text.js";
 
 const GROUP = "workbench";
-const UNIT = { rate: "deg/s", position: "deg", acceleration: "deg/s²", temperature: "°C", time: "s", supply: "V", other_rate: "deg/s" };
+const UNIT = { rate: "deg/s", position: "deg", acceleration: "deg/s²", temperature: "°C", time: "s", supply: "V", other_rate: "deg/s", duration: "s", set_point: "" };
 const STEADY = 3;
 const DETAIL_MS = 120;
 
 export const alongName = ({ kind, axis, covariate }) => t(`diagnosis.along.${kind}`, { axis, covariate });
 
-/** The pictures of one recording. detail([from, to]) gives a fit of a stretch in full; pointed(along) hears a guess. */
-export function pictures(place, { unit, detail, pointed }) {
+/** The pictures of one recording, or of readings ("rate" or "position" in `points`) against their reference. detail([from, to]) gives a fit of a stretch in full; pointed(along) hears a guess. */
+export function pictures(place, { unit, points, detail, pointed }) {
   const sentence = h("h1", { class: "says" });
   const traces = h("div", { class: "stack traces" });
   const grid = h("div", { class: "multiples" });
   place.replaceChildren(sentence, traces,
     h("p", { class: "small muted no-print" }, t("chart.hint")),
     h("h2", { id: "against" }, t("workbench.against")), grid);
-  const time = { label: t("chart.time"), unit: "s", digits: 2 };
+  const time = points ? { label: t("chart.encoder"), unit, digits: 2, pad: true } : { label: t("chart.time"), unit: "s", digits: 2 };
+  const left = points ? unit : "deg/s";
   let shown = null;
   let base = 0;
   let waiting = 0;
@@ -27,19 +28,19 @@ export function pictures(place, { unit, detail, pointed }) {
   let isHiding = false;
 
   const overlay = chart(traces, {
-    name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t("chart.output"), unit, digits: 4 },
+    name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t(points ? "chart.gyro" : "chart.output"), unit, digits: points ? 3 : 4 },
     waiting: t("workbench.loading"), onZoom,
     series: [
-      { name: t("chart.measured"), role: "measured", draw: "line" },
+      { name: t("chart.measured"), role: "measured", draw: points ? "points" : "line" },
       { name: t("workbench.modelled"), role: "model", draw: "dash", joined: true },
     ],
   });
   const residual = chart(traces, {
-    name: t("workbench.residual"), group: GROUP, height: 150, x: time, y: { label: t("chart.residual"), unit: "deg/s", zero: true, digits: 3 },
+    name: t(points ? "workbench.residual_points" : "workbench.residual"), group: GROUP, height: 150, x: time, y: { label: t("chart.residual"), unit: left, zero: true, digits: 3 },
     waiting: t("workbench.fitting"),
     series: [
-      { name: t("chart.residual"), role: "residual", draw: "line" },
-      { name: t("workbench.other"), role: "model", draw: "dots" },
+      { name: t("chart.residual"), role: "residual", draw: points ? "dust" : "line" },
+      { name: t("workbench.other"), role: "model", draw: points ? "faint" : "dots" },
     ],
   });
   const multiples = new Map();
@@ -60,7 +61,7 @@ export function pictures(place, { unit, detail, pointed }) {
     const figure = h("div", { class: "multiple", "data-along": along.covariate });
     const plot = chart(figure, {
       name, height: 150, tight: true, waiting: t("workbench.fitting"),
-      x: { label: name, unit: UNIT[along.kind] ?? "", digits: 2, pad: true, bare: true }, y: { label: t("chart.residual"), unit: "deg/s", zero: true, digits: 3, bare: true },
+      x: { label: name, unit: UNIT[along.kind] ?? "", digits: 2, pad: true, bare: true }, y: { label: t("chart.residual"), unit: left, zero: true, digits: 3, bare: true },
       series: [
         { reads: t("chart.residual"), role: "residual", draw: "dust" },
         { reads: t("chart.mean"), role: "residual", draw: "line", joined: true, digits: 3 },
@@ -99,7 +100,7 @@ export function pictures(place, { unit, detail, pointed }) {
       band: { x: c.window_s, half: c.spread.map((s) => 2 * s) }, limits: [-y, y],
       shade: failures.filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
     });
-    residual.rename(compared ? t("workbench.residual_two") : t("workbench.residual"), t("chart.residual"));
+    residual.rename(compared ? t("workbench.residual_two") : t(points ? "workbench.residual_points" : "workbench.residual"), t("chart.residual"));
     sentence.textContent = isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits");
     for (const one of along) {
       if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
@@ -113,6 +114,7 @@ export function pictures(place, { unit, detail, pointed }) {
       says.textContent = isHiding ? "" : failing ? failing.sentence : t("workbench.no_failure");
       figure.classList.toggle("failing", Boolean(failing));
     }
+    if (points) return;
     if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
     spectrum.set([c.frequency_hz, c.density, new Array(c.density.length).fill(shown.white_density)]);
   }

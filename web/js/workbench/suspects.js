@@ -13,7 +13,7 @@ function length(z, threshold, largest) {
   return QUARTER + (100 - QUARTER) * (Math.log(z / threshold) / Math.log(Math.max(largest / threshold, 4)));
 }
 
-/** Shows `answer` of the server in place. open(effect), toggle(effect, inModel), decide() are what its
+/** Shows `answer` of the server in place. open(effect), toggle(effect, inModel), decide() (null: no motion can) are what its
  * buttons do; `guess` is the effect that the student named. */
 export function showSuspects(place, answer, { open, toggle, decide, guess }) {
   const { suspects, threshold } = answer;
@@ -42,7 +42,7 @@ export function showSuspects(place, answer, { open, toggle, decide, guess }) {
     const group = s.tie === null ? [s] : tied.get(s.tie);
     for (const one of group) drawn.add(one.effect);
     rows.push([group, group.length < 2 ? row(s)
-      : h("li", { class: "tied" }, h("div", { class: "row spread" }, h("p", { class: "small" }, t("workbench.tied")), h("button", { type: "button", class: "add decide", onclick: decide }, t("workbench.decide"))), h("ul", {}, group.map(row)))]);
+      : h("li", { class: "tied" }, h("div", { class: "row spread" }, h("p", { class: "small" }, t("workbench.tied")), decide && h("button", { type: "button", class: "add decide", onclick: decide }, t("workbench.decide"))), h("ul", {}, group.map(row)))]);
   }
   const isFirst = ([group], k) => k < FEW || group.some((s) => s.in_model || !["nothing", "no_data", "not_excited", "spanned"].includes(s.word) || s.effect === guess);
   const first = rows.filter(isFirst);
