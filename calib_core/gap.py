@@ -188,6 +188,8 @@ def _sought(search: Search) -> None:
     """Adds what is missing, and takes away what does not hold."""
     search.run()
     search.merge()
+    if len(search.chosen) - search.given > 1:
+        search.exchange()
     search.confirm()
     _agree(search)
 

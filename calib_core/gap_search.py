@@ -26,6 +26,8 @@ REST = 0.1
 """Or this share of what is left: then the form is not what is meant."""
 RIVAL = 6.0
 """2ΔlnL within which two explanations cannot be told apart."""
+PLACED = 4.0
+"""2ΔlnL that a step gains by being put where noise likes it best."""
 MOST = 3
 STEP_EVERY_S, STEPS = 4.0, 40.0
 CLEAN = 1e-3
@@ -239,7 +241,9 @@ class Search:
                 del rivals[0]
             rest = self.chi2(self.chosen)
             share = SHARE_RATE if self.space.design.reference == "rate" else SHARE
-            if not rivals or rivals[0].gain < min(share * (self.chi2([]) - rest), REST * rest):
+            if not rivals or self._beside_refined(rivals[0].term, rest) < min(
+                share * (self.chi2([]) - rest), REST * rest
+            ):
                 return
             simplest = min((s for s in rivals if rivals[0].gain - s.gain < 1.0), key=lambda s: len(s.term.setting))
             self.findings.append(Finding(simplest, rivals, self.threshold))
@@ -268,6 +272,23 @@ class Search:
                 field.append(Suspicion(term, now - chi2, float(equivalent_z(now - chi2, term.freedom))))
         return sorted(field, key=lambda s: -s.gain)
 
+    def _beside_refined(self, term: Term, rest: float) -> float:
+        """What ``term`` takes off the χ² ``rest`` when the chosen ones' nonlinear parameters give way to it."""
+        trial = Search(self.space, self.suspects, self.rng, [*self.chosen, term], columns=self.columns)
+        trial.settle()
+        return rest - trial.chi2(trial.chosen)
+
+    def exchange(self) -> None:
+        """Puts in the place of each chosen effect the rival that does better now that the others are there."""
+        for k, others in enumerate(self.rivals()):
+            own = next((s.gain for s in others if s.term is self.chosen[k]), -math.inf)
+            if k >= self.given and others[0].gain > own + 1.0:
+                best = others[0]
+                z = float(equivalent_z(best.gain, best.term.freedom))
+                self.chosen[k] = best.term
+                self.findings[k - self.given].chosen = Suspicion(best.term, best.gain, z)
+                return
+
     def rivals(self) -> list[list[Suspicion]]:
         """For each chosen effect, every effect that would serve in its place, the others kept: itself first or near."""
         answer = []
@@ -282,8 +303,8 @@ class Search:
                     other, chi2 = self.refined(s.term, others)
                     if not (other.effect.positive and self.value(other, others) < 0.0):
                         field.append(Suspicion(other, now - chi2, 0.0))
-            best = max(s.gain for s in field)
-            answer.append([s for s in sorted(field, key=lambda s: -s.gain) if best - s.gain < RIVAL])
+            field.sort(key=lambda s: -s.gain)
+            answer.append([s for s in field if field[0].gain - s.gain < _margin(field[0], s)])
         return answer
 
     def confirm(self) -> None:
@@ -344,6 +365,14 @@ class Search:
             for k, term in enumerate(self.chosen):
                 if term.effect.nonlinear() or term.effect.curvature is not None:
                     self.chosen[k], _ = self.refined(term, [*self.chosen[:k], *self.chosen[k + 1 :]])
+
+
+def _margin(best: Suspicion, other: Suspicion) -> float:
+    """2ΔlnL within which ``other`` serves as well as the ``best``: forms are never quite right, but those of late
+    answers, which are series in the same small number; and a step is at the best of many places."""
+    if best.term.effect.curvature is not None and other.term.effect.curvature is not None:
+        return RIVAL
+    return RIVAL + 0.5 * SHARE * best.gain + (PLACED if best.term.name == "bias_step" else 0.0)
 
 
 def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:

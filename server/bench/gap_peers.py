@@ -136,9 +136,9 @@ def _problem(made: Record) -> tuple[list[str], F64, F64, F64]:
             continue
         grid = settings(effect, space)
         for setting in grid[:: max(1, len(grid) // GRID)]:
-            term = space.term(effect, setting)
-            columns.append(term.columns)
-            names += [name] * term.columns.shape[1]
+            _, shapes = space.shapes(space.term(effect, setting))
+            columns.append(shapes)
+            names += [name] * shapes.shape[1]
     wide = np.column_stack(columns)
     spread = wide.std(axis=0)
     useful = np.flatnonzero(spread > 1e-12)
