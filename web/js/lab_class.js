@@ -36,6 +36,7 @@ export async function classroom(main, exercise, key) {
           button.disabled = true;
           button.textContent = t("lab.working");
           await attempt(work);
+          delete button.dataset.sure;
           button.disabled = false;
           button.textContent = text;
           return;
