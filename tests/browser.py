@@ -120,13 +120,14 @@ class Window:
         assert len(refused) <= refusals, refused
 
 
-def serious(browser: Any, server: Server, paths: Sequence[str]) -> list[str]:
-    """What axe-core calls serious or critical on these pages, dark and light in turn."""
+def serious(browser: Any, server: Server, paths: Sequence[str], *, first: str = "") -> list[str]:
+    """What axe-core calls serious or critical on these pages, dark and light in turn; ``first`` is run before each."""
     from axe_playwright_python.sync_playwright import Axe
 
     found = []
     # The pages' own policy forbids the script that axe is.
     context = browser.new_context(viewport=DESK, locale="en-US", base_url=server.url, bypass_csp=True)
+    context.add_init_script(first)
     page = context.new_page()
     for k, path in enumerate(paths):
         page.emulate_media(color_scheme=("light", "dark")[k % 2])

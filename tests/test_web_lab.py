@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serving
+from browser import PHONE, Server, Window, chromium, serious, serving
 
 SHORT = [
     {"axis": "x", "kind": "sine", "amplitude_deg": [30.0], "frequency_hz": [0.2513], "duration_s": 12.0},
@@ -173,5 +173,9 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         assert "Right:" in student.text(".mark")
         assert "reversal" in student.text(".about")
         assert student.widest() <= PHONE["width"]
+        kept = [window.evaluate("() => localStorage['gyrobench.lab']") for window in (page, bench)]
+        known = {name: value for text in kept for name, value in json.loads(text)[code].items()}
+        first = f"localStorage['gyrobench.lab'] = JSON.stringify({json.dumps({code: known})})"
+        assert serious(browser, server, [f"/lab.html?code={code}", f"/lab.html?code={code}&student"], first=first) == []
         teacher.close()
         student.close(refusals=1)

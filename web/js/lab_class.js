@@ -83,7 +83,7 @@ export async function classroom(main, exercise, key) {
     shown = now;
     items = found;
     const board = page.truth;
-    truth.replaceChildren(truthList(board, words, effects), h("p", { class: "small muted" }, t("lab.truth_board", { bias: board.bias_V, scale: 1000 * board.scale_factor_V_per_dps, seed: String(board.seed) })));
+    truth.replaceChildren(h("h2", { class: "for-print" }, t("lab.truth")), truthList(board, words, effects), h("p", { class: "small muted" }, t("lab.truth_board", { bias: board.bias_V, scale: 1000 * board.scale_factor_V_per_dps, seed: String(board.seed) })));
     if (exercise.revealed_at) {
       summary.textContent = t("lab.truth");
       hidden.open = true;
