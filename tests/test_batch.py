@@ -3,7 +3,9 @@
 import csv
 import io
 import os
+import re
 import signal
+import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -11,14 +13,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+import uvicorn
 from recordings import to_csv, to_parquet
 from sessions import session_recording
-from starlette.testclient import TestClient
+from shared import ROOT
 
 from server import batch_work
 from server.app import create_app
 from server.batch_engine import file_of
+from server.commands.serve import listen
 from server.settings import Settings
 from server.store import Store
 
@@ -29,9 +34,14 @@ class Lab:
     """A server's routes and its batch process, without the bench."""
 
     def __init__(self, data: Path) -> None:
-        self.app = create_app(Settings(data))
-        self.services = self.app.state.services
-        self.http = TestClient(self.app, base_url="http://testserver/api/v1")
+        app = create_app(Settings(data))
+        self.services = app.state.services
+        listener = listen("127.0.0.1", 0)
+        self.address = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        self.server = uvicorn.Server(uvicorn.Config(app, lifespan="off", log_level="error"))
+        self.thread = threading.Thread(target=self.server.run, args=([listener],))
+        self.thread.start()
+        self.http = httpx.Client(base_url=f"{self.address}/api/v1", timeout=PATIENCE_S)
 
     def send(self, *files: tuple[str, bytes], key: str = "", **fields: str) -> Any:
         headers = {"Idempotency-Key": key} if key else {}
@@ -56,6 +66,9 @@ class Lab:
         return self.until(batch, lambda shown: shown["finished_at"])
 
     def close(self) -> None:
+        self.http.close()
+        self.server.should_exit = True
+        self.thread.join()
         self.services.batches.close()
         self.services.compute.close()
         self.services.store.close()
@@ -201,3 +214,19 @@ def test_results_come_as_one_table_and_as_a_zip_of_every_document(lab: Lab, mixe
         assert set(packed.namelist()) == {"results.csv"} | documents
         number = files[0]["certificate"]
         assert packed.read(f"{number}.pdf") == lab.http.get(f"/certificates/{number}.pdf?lang=th").content
+
+
+def test_the_example_in_the_readme_runs_as_it_is_written(
+    lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(import time.*?)```", readme, re.DOTALL)
+    (tmp_path / "boards").mkdir()
+    (tmp_path / "boards" / "A.parquet").write_bytes(board("A"))
+    (tmp_path / "boards" / "words.csv").write_text("hello\n")
+    monkeypatch.chdir(tmp_path)
+    exec(program.replace("http://127.0.0.1:8000", lab.address), {})
+    said = capsys.readouterr().out
+    assert "words.csv: Line 1: there is no column time_s" in said
+    with zipfile.ZipFile("results.zip") as packed:
+        assert len(packed.namelist()) == 4

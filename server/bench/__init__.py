@@ -13,6 +13,8 @@ from calib_core.problem import Problem
 SUBJECTS: dict[str, tuple[str, ...]] = {
     "core": ("core", "boards", "parsing", "calibration", "startup"),
     "bus": ("bus", "bus_daq"),
+    "batch": ("batch", "batch_store", "batch_fleet"),
+    "live": ("live",),
     "coverage": ("coverage",),
     "gap": ("gap", "gap_real", "gap_cost", "gap_peers"),
 }
