@@ -47,14 +47,18 @@ class BatchProcess:
                 except OSError:
                     log.debug("the batch process has just ended; the next one looks by itself")
 
-    def close(self) -> None:
-        """Ends the process. Files that it was at wait for the next server."""
+    def stop(self) -> None:
+        """Tells the process to end. Files that it was at wait for the next server."""
         self._closing = True
         self._news.set()
         with self._lock:
             if self._pipe is not None:
                 self._pipe.close()
                 self._pipe = None
+
+    def close(self) -> None:
+        """Ends it, by force where it takes too long."""
+        self.stop()
         if self._thread is not None:
             self._thread.join(2 * CLOSE_S)
 

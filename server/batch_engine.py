@@ -9,8 +9,10 @@ import json
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import threading
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -28,6 +30,7 @@ IDLE_S = 120.0
 """Workers that nobody needs hold some 200 MB each."""
 AGAIN_S = 5.0
 """After which a cluster or a disk that failed is asked again."""
+KEPT_DAYS = 30
 GATHER_S = 0.1
 MOST_AT_ONCE = 32
 """Results that go to disk together: one wait for the disk instead of one each."""
@@ -51,6 +54,14 @@ def file_of(data: Path, batch: str, position: int) -> Path:
     return folder_of(data, batch) / f"{position:06d}"
 
 
+def forget(store: Store) -> None:
+    """Removes uploads that nobody tried again for KEPT_DAYS, and what a server that was killed had half received."""
+    oldest = time.time() - 86400 * KEPT_DAYS
+    for folder in (store.data / "batches").glob("*"):
+        if folder.stat().st_mtime < oldest and not store.batches.is_open(folder.name):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 class Engine:
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -65,6 +76,7 @@ class Engine:
         threading.Thread(target=self._listen, args=(news, loop), name="news", daemon=True).start()
         writing = asyncio.create_task(self._write())
         self._store.batches.wait_again()
+        await asyncio.to_thread(forget, self._store)
         try:
             while not self._over:
                 waiting = self._store.batches.count_waiting()

@@ -112,6 +112,9 @@ class Batches:
     def count_waiting(self) -> int:
         return int(self._at.rows("select count(*) as n from batch_files where status = 'waiting'")[0]["n"])
 
+    def is_open(self, batch: str) -> bool:
+        return bool(self._at.rows(f"select 1 from batches where id = ? and {OPEN}", [batch]))
+
     def begin(self, batch: str) -> None:
         if self._at.rows("select 1 from batches where id = ? and status = 'queued'", [batch]):
             with self._at.write() as db:

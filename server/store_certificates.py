@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from calib_core.problem import Problem
-from server.store_db import SEARCHED, Connection, Row, dumps, like, now, page
+from server.store_db import Connection, Row, dumps, like, now, page
 
 SELECT = "select rowid as at, number, board, recording, verdict, issued_at, operator from certificates"
 
@@ -55,9 +55,10 @@ class Certificates:
         where, values = [], []
         if q:
             # The index alone has every text that is searched; the table's rows are some 70 kB each.
-            found = "select rowid from certificates indexed by idx_certificates_search"
-            where.append(f"rowid in ({found} where {SEARCHED} like ? escape '\\')")
-            values.append(like(q))
+            found = "select rowid from certificates indexed by idx_certificates_number_board_operator"
+            words = " or ".join(f"{column} like ? escape '\\'" for column in ("number", "board", "operator"))
+            where.append(f"rowid in ({found} where {words})")
+            values += [like(q)] * 3
         for column, wanted in (("board", board), ("recording", recording)):
             if wanted:
                 where.append(f"{column} = ?")

@@ -120,17 +120,17 @@ def _owners(db: Database) -> None:
     db.table("runs").add_column("owner", str)
 
 
-SEARCHED = "number || ' ' || board || ' ' || operator"
-
-
-@migrations(name="0012_search")
+@migrations(name="0013_search")
 def _search(db: Database) -> None:
-    """What is looked for among 10^5: boards' certificates and recordings, a recording that is here already, and one
-    text a certificate to search, so that a search reads an index and not the certificates."""
-    db.table("certificates").create_index(["board"])
-    db.execute(f"create index idx_certificates_search on certificates ({SEARCHED})")
-    db.table("recordings").create_index(["board"])
-    db.table("recordings").create_index(["digest"])
+    """What is looked for among 10^5: a board's certificates and recordings, a recording that is here already, and the
+    words of a certificate, so that a search reads an index and not the certificates."""
+    for table, columns in (
+        ("certificates", ["board"]),
+        ("certificates", ["number", "board", "operator"]),
+        ("recordings", ["board"]),
+        ("recordings", ["digest"]),
+    ):
+        db.table(table).create_index(columns, if_not_exists=True)
 
 
 class Connection:

@@ -22,7 +22,7 @@ from shared import ROOT
 
 from server import batch_work
 from server.app import create_app
-from server.batch_engine import file_of
+from server.batch_engine import file_of, forget
 from server.commands.serve import listen
 from server.settings import Settings
 from server.store import Store
@@ -152,6 +152,18 @@ def test_only_files_that_may_be_tried_again_stay_on_the_disk(lab: Lab, mixed: di
     data = lab.services.store.data
     there = [file["name"] for file in lab.files(mixed["id"]) if file_of(data, mixed["id"], file["position"]).exists()]
     assert there == ["words.csv", "empty.csv", "bad name!.parquet"]
+
+
+def test_uploads_that_nobody_tried_again_are_removed_and_open_batches_are_not(tmp_path: Path) -> None:
+    with Store(tmp_path) as store:
+        for name, error in (("ended", {"code": "batch.file_gone", "values": {}}), ("open", None), ("fresh", None)):
+            file_of(tmp_path, name, 1).parent.mkdir(parents=True)
+            file_of(tmp_path, name, 1).write_bytes(b"x")
+            if name != "fresh":
+                os.utime(file_of(tmp_path, name, 1).parent, (0, 0))
+                store.batches.create(name, [{"name": "A", "size": 1, "error": error}], name="A", fingerprint=name)
+        forget(store)
+    assert {folder.name for folder in (tmp_path / "batches").iterdir()} == {"open", "fresh"}
 
 
 def test_a_repeated_request_is_harmless_and_another_under_its_key_is_refused(lab: Lab) -> None:

@@ -141,6 +141,17 @@ def test_a_recording_that_nobody_sealed_is_counted_as_it_stands(store: Store) ->
     assert (store.recordings.row(empty)["samples"], store.recordings.row(empty)["duration_s"]) == (0, 0.0)
 
 
+@pytest.mark.parametrize("wanted", [{"board": "LPY-1"}, {"q": "LPY"}, {"cursor": "7"}])
+def test_a_list_of_certificates_reads_indexes_and_never_all_of_the_table(store: Store, wanted: dict[str, str]) -> None:
+    store.issue_certificate(content("a"))
+    asked: list[tuple[str, Any]] = []
+    with store.connection.db.tracer(lambda sql, values: asked.append((sql, values))):
+        store.certificates.find(**wanted)
+    (plan,) = [store.connection.rows(f"explain query plan {sql}", values or ()) for sql, values in asked]
+    steps = [row["detail"] for row in plan if row["detail"].startswith("SCAN certificates")]
+    assert all("USING COVERING INDEX" in step for step in steps), plan
+
+
 # --- faults ----------------------------------------------------------------------------------------------------
 def test_a_full_disk_is_a_sentence_and_leaves_no_half_row(store: Store) -> None:
     made = recording(store)

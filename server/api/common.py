@@ -35,6 +35,7 @@ class Services:
         self.batches.resume()
 
     def close(self) -> None:
+        self.batches.stop()  # takes a second or two, beside the next
         self.supervisor.close()
         self.batches.close()
         self.compute.close()
