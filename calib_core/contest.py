@@ -6,14 +6,14 @@ A truth's signal, less all that base and a rival can explain of it at any settin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_core.effects import Effect, Param
+from calib_core.effects import Acts, Effect, Param
 from calib_core.effects.saturation import Saturation
 from calib_core.excitation import Excitation
 from calib_core.gap_search import settings
@@ -26,6 +26,10 @@ Setting = tuple[float, ...]
 
 BASE = 3
 """Bias, scale factor, and what sampling hides."""
+SHOWN = 17.6
+"""2ΔlnL at which an effect is found four times in five (METHOD 3); what would give less, a record does not test."""
+USUAL_V_PER_DPS = 5.9e-3
+SHEET = PRESETS["LPY503AL-OUT"].axes["x"].scale_factor_V_per_dps
 CLIPS = 16
 """Clip levels tried, from half of the fastest rate on."""
 
@@ -107,6 +111,35 @@ class Contest:
         return row
 
 
+def usual(space: Space, effect: type[Effect]) -> tuple[Setting, F64]:
+    """The effect at the size that METHOD calls strength 1: its setting, and its coefficients (p,) in this unit."""
+    known = effect.parameters()
+    setting = tuple(known[name].typical for name in effect.nonlinear())
+    if effect.name == "bias_step":
+        setting = (float(space.covariates.time_s[-1]) / 2.0,)
+    names = space.term(effect, setting).names
+    sizes = np.array([known[n].typical if n else 1.0 for n in names])
+    # Typical sizes of what acts on the output are volts of the thesis' gyro.
+    volts = effect.acts is Acts.OUTPUT and space.design.averages.samples.unit != "V"
+    return setting, sizes * (abs(space.scale_factor) or 1.0) / USUAL_V_PER_DPS if volts else sizes
+
+
+def powers(space: Space, suspects: Mapping[str, type[Effect]], kept: Sequence[Term]) -> dict[str, float]:
+    """2ΔlnL that each suspect of usual size would have, beside base and ``kept``, in the record of ``space``."""
+    signals = [
+        _term(space, effect, setting).columns @ sizes
+        for effect in suspects.values()
+        for setting, sizes in [usual(space, effect)]
+    ]
+    if not signals:
+        return {}
+    held = np.column_stack([space.base, *(t.columns for t in kept)])
+    white = space.white(np.column_stack([held, *signals]))
+    white[-len(space.prior) :, : len(space.prior)] = np.diag(space.prior)
+    columns, width = Columns.of(white), held.shape[1]
+    return {n: columns.unexplained(width + k, range(width)) for k, n in enumerate(suspects)}
+
+
 def sizes_in(hand: Hand, term: Term) -> F64:
     """(p,) the coefficients of ``term`` in the data in hand, beside base and what is kept."""
     if term.fixed:
@@ -145,9 +178,7 @@ def values_of(hand: Hand) -> F64:
     values = hand.space.values
     if len(values) > 1:
         return values
-    unit = hand.space.design.averages.samples.unit
-    sheet = PRESETS["LPY503AL-OUT"].axes["x"].scale_factor_V_per_dps
-    return np.array([values[0], sheet if unit == "V" else 1.0])
+    return np.array([values[0], SHEET if hand.space.design.averages.samples.unit == "V" else 1.0])
 
 
 def _term(space: Space, effect: type[Effect], setting: Setting) -> Term:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_core import gap_unknown
-from calib_core.contest import Columns, Contest, sizes_in, values_of
+from calib_core.contest import Columns, Contest, sizes_in, usual, values_of
 from calib_core.effects import Effect
 from calib_core.excitation import Excitation, menu
 from calib_core.gap import BY_ITSELF, Diagnosis
@@ -178,10 +178,7 @@ def excite(
     truths = []
     for effect in suspects:
         if not effect.missing(hand.space.covariates) and effect.name not in BY_ITSELF:
-            known = effect.parameters()
-            setting = tuple(known[name].typical for name in effect.nonlinear())
-            names = hand.space.term(effect, setting).names
-            truths.append((effect, setting, np.array([known[n].typical if n else 1.0 for n in names])))
+            truths.append((effect, *usual(hand.space, effect)))
     if not truths:
         return None
     contest = Contest(hand, truths, [])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_core import covariates, gap_saturation
+from calib_core import contest, covariates, gap_saturation
 from calib_core.effects import Effect, library
 from calib_core.gap_checks import Check, checks
 from calib_core.gap_error import Explanation
@@ -239,12 +239,15 @@ def _structure(answer: Diagnosis, search: Search) -> None:
 
 
 def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis) -> list[dict[str, Any]]:
-    """Every effect of the library: tested, not excited by this motion, or without data."""
+    """Every effect of the library: tested, not excited by this motion (or too little to be seen), or without data."""
     c, chosen = search.space.covariates, {t.name for t in search.chosen}
     tested = {s.term.name: s for s in search.last}
     # Beside what was chosen its rivals have nothing left of their own: they were tested when it was.
     tested = {s.term.name: s for f in search.findings for s in f.field} | tested
     tested |= {f.chosen.term.name: f.chosen for f in search.findings}
+    power = contest.powers(search.space, search.suspects, search.chosen)
+    weak = {n for n, s in tested.items() if n not in chosen and max(power.get(n, 0.0), s.gain) < contest.SHOWN}
+    weak -= {s.term.name for rivals in answer.rivals for s in rivals}
     rows = []
     for name, effect in pool.items():
         row: dict[str, Any] = {
@@ -264,6 +267,8 @@ def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis
             row["two_delta_lnL"] = answer.walk.two_delta_lnL if answer.walk else 0.0
         elif name == "adc_quantization":
             row["two_delta_lnL"] = on_grid(answer) if answer.coarse else 0.0
+        elif name in weak:
+            row["status"] = "not_excited"
         elif name in tested:
             row["two_delta_lnL"], row["p"] = tested[name].gain, p_value(tested[name].z)
         elif name not in BY_ITSELF and name not in chosen:

@@ -25,6 +25,8 @@ CERTAIN, LIKELY = 1e-6, 1e-3
 ABOVE_FLOOR = 1.1
 STANDS_OUT = 10.0
 """2ΔlnL by which one effect of a few stands out from noise."""
+NEVER = ("input_loading",)
+"""No recording shows it: it hides in bias and scale factor, and only the datasheet tells of it."""
 STILL = {"rate": 0.5, "acceleration": 0.5, "other_rate": 0.5}
 """Below this a covariate is said to stand still."""
 KINDS = {
@@ -183,6 +185,7 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
     joint = "bracketed" if verdict == "ambiguous" and len(answer["missing"]) > 1 else "either"
     findings = [effect_words(tied.get(m["effect"], [m["effect"]]), joint) for m in answer["missing"]]
     values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": _joined("both", findings)}
+    values["count"] = sum(candidate["status"] == "not_excited" for candidate in answer["candidates"])
     if verdict == "unknown":
         values["along"] = along(answer["unknown"]["covariate"])
         verdict = "unknown_beside" if findings else "unknown"
@@ -190,6 +193,8 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
         verdict = "ambiguous_several"
     elif verdict == "adequate" and before > ABOVE_FLOOR * floor:
         verdict = "adequate_above_floor"
+    elif verdict == "adequate" and values["count"]:
+        verdict = "adequate_partly"
     return {"code": f"diagnosis.{verdict}", "values": values}
 
 
@@ -249,7 +254,7 @@ def _limits(answer: Words) -> Iterator[Words]:
         yield limit("reference")
         yield limit("no_time")
     for status in ("not_excited", "no_data") if timed else ("not_excited",):
-        names = [c["effect"] for c in answer["candidates"] if c["status"] == status]
+        names = [c["effect"] for c in answer["candidates"] if c["status"] == status and c["effect"] not in NEVER]
         if names:
             yield limit(status, effects=[effect_word(name) for name in names])
 
@@ -302,6 +307,8 @@ def effect_words(names: Sequence[str], joint: str = "either") -> Any:
 def _joined(joint: str, words: Sequence[object]) -> Any:
     if len(words) < 2:
         return list(words)
+    if joint == "either" and len(words) > 2:
+        joint = "one_of"
     return {"code": f"diagnosis.{joint}", "values": {"some": list(words[:-1]), "last": words[-1]}}
 
 
