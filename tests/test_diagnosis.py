@@ -25,10 +25,11 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A hundred seconds of one sine with a lag in it, which one frequency cannot tell from a delay."""
+    """Half a minute of one sine with a lag in it, which one frequency cannot tell from a delay."""
     path = tmp_path_factory.mktemp("gap") / "sine.csv"
     with path.open("wb") as opened:
-        write_csv(as_recording(record(3, {"bandwidth_lag": 2.0}, plan="sine")), opened)
+        whole = as_recording(record(3, {"bandwidth_lag": 2.0}, plan="sine"))
+        write_csv(whole.take(whole.time_s < 35.0), opened)
     return path
 
 
@@ -134,9 +135,11 @@ def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]
 
 
 def test_the_command_prints_one_json_object_an_input(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, err = run(capsys, "--json", str(file), str(file))
-    first, second = (json.loads(line) for line in out.splitlines())
-    assert (code, err, first) == (0, "", second)
+    readings = ROOT / "calib_core" / "thesis" / "data" / "rate.csv"
+    code, out, err = run(capsys, "--json", "--axis", "x", str(file), str(readings))
+    first, *boards = (json.loads(line) for line in out.splitlines())
+    assert (code, err) == (0, "")
+    assert [(told["recording"]["board"], told["axis"]) for told in boards] == [("1", "x"), ("2", "x")]
     assert set(first) >= KEYS
     assert first["recording"]["file"] == "sine.csv"
     assert first["verdict"] == "ambiguous"
