@@ -96,7 +96,8 @@ class Proposal:
 
     def to_json(self) -> dict[str, Any]:
         """CONTRACT 3's ``next_experiment``; its sentence is rendered from code and values."""
-        code = f"experiment.{self.kind}" if self.decides else "experiment.none_decides"
+        near = "probable" if self.expected >= DECIDES / 2.0 else "none_decides"
+        code = f"experiment.{self.kind if self.decides else near}"
         values = {"duration_s": self.offer.duration_s, "expected": self.expected, "needed": DECIDES}
         return {
             "separates": list(self.separates),

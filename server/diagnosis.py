@@ -191,6 +191,8 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
         verdict = "unknown_beside" if findings else "unknown"
     elif joint == "bracketed":
         verdict = "ambiguous_several"
+    elif verdict == "missing" and [m["effect"] for m in answer["missing"]] == ["saturation"]:
+        verdict = "clipped"  # both errors are of what lies between the limits
     elif verdict == "adequate" and before > ABOVE_FLOOR * floor:
         verdict = "adequate_above_floor"
     elif verdict == "adequate" and values["count"]:

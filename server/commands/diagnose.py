@@ -100,7 +100,8 @@ def lines(answer: dict[str, Any], lang: str) -> Iterator[str]:
         yield from head("next", [answer["next_experiment"]["sentence"]])
     if answer["error"] is not None:
         yield from head("error", _errors(answer, lang))
-        yield from head("parameters", _parameters(answer["after"]["parameters"], lang))
+        found = [*answer["after"]["parameters"], *(p for m in answer["missing"] for p in m["parameters"])]
+        yield from head("parameters", _parameters(list({p["name"]: p for p in found}.values()), lang))
     yield ""
 
 
