@@ -109,5 +109,5 @@ def peak_MB() -> float:
     except ImportError:  # Windows keeps it elsewhere
         import psutil
 
-        return float(psutil.Process().memory_info().peak_wset / 1e6)
+        return float(psutil.Process().memory_info().peak_wset / 1e6)  # type: ignore[attr-defined]
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
