@@ -16,7 +16,7 @@ from servos import Servos, start
 
 from calib_core.problem import Problem
 from calib_core.sequence import Move, Wave
-from server.devices import DeviceError, dynamixel_bus, dynamixel_table
+from server.devices import DeviceError, dynamixel_bus, dynamixel_servos, dynamixel_table
 from server.devices.dynamixel_registers import Register, to_deg, word
 from server.devices.dynamixel_table import DynamixelTable
 
@@ -350,9 +350,11 @@ def test_a_busy_host_is_no_silent_servo_and_ends_it_only_after_a_while(
     with monkeypatch.context() as patch:
         patch.setattr(dynamixel_bus, "STAMP_S", -1.0)  # every reply comes too late to know when it was made
         began = time.perf_counter()
-        wait(lambda: time.perf_counter() - began > 1.5 * dynamixel_table.SILENT_S and not len(table.read()["x"].time_s))
+        wait(
+            lambda: time.perf_counter() - began > 1.5 * dynamixel_servos.SILENT_S and not len(table.read()["x"].time_s)
+        )
     wait(lambda: len(table.read()["x"].time_s))
-    monkeypatch.setattr(dynamixel_table, "BUSY_S", 2.0 * dynamixel_table.SILENT_S)
+    monkeypatch.setattr(dynamixel_servos, "BUSY_S", 2.0 * dynamixel_servos.SILENT_S)
     monkeypatch.setattr(dynamixel_bus, "STAMP_S", -1.0)
     assert fault(table).code == "rig.host_busy"
 
