@@ -170,12 +170,12 @@ class Bus:
         buffer = bytearray()
         while True:
             master = self._master
-            ready, _, _ = select.select([self._wake_read, *([master] if master >= 0 else [])], [], [])
-            if self._wake_read in ready:
-                os.read(self._wake_read, 64)
-                buffer.clear()
-                continue
             try:
+                ready, _, _ = select.select([self._wake_read, *([master] if master >= 0 else [])], [], [])
+                if self._wake_read in ready:
+                    os.read(self._wake_read, 64)
+                    buffer.clear()
+                    continue
                 buffer += os.read(master, 4096)
             except OSError:  # unplugged in between
                 continue
