@@ -16,6 +16,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "batch": ("batch", "batch_store", "batch_fleet"),
     "live": ("live",),
     "coverage": ("coverage",),
+    "workbench": ("workbench",),
     "gap": ("gap", "gap_real", "gap_cost", "gap_peers"),
 }
 
