@@ -111,7 +111,7 @@ async function open(main, recording, row, signal) {
   }
 
   function refresh() {
-    if (!answer) return;
+    if (!answer || !cards.size) return;
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
     if (hidden) {
@@ -188,9 +188,10 @@ async function open(main, recording, row, signal) {
   // The page is there; numbers come into their places.
   (async () => {
     try {
-      for (const card of (await api.effects()).items) cards.set(card.name, card);
       book.write({ step: "opened", recording, name, axis, samples: signal.samples, duration_s: signal.duration_s });
-      await change([]);
+      const library = api.effects().then(({ items }) => { for (const card of items) cards.set(card.name, card); });
+      await Promise.all([library, change([])]);
+      refresh();
       if (answer && !isGuessing.checked) book.write({ step: "verdict", code: answer.code, values: answer.values });
     } catch (problem) { say(error, problem); }
   })();
