@@ -95,26 +95,28 @@ class Workbench:
         return gap.diagnose(self.recording, self.axis)
 
     @cached_property
-    def _space(self) -> Space:
-        return gap.prepare(self.recording, self.axis)
+    def _parts(self) -> tuple[Workspace, Workspace | None, gap_saturation.Clip | None]:
+        """All samples; those that are on no limit, and the limits, where these explain more than any other effect."""
+        space = gap.prepare(self.recording, self.axis)
+        clip = gap_saturation.find(self.recording, self.axis, space.design, space.rough_noise)
+        whole = _workspace(space)
+        if clip is None:
+            return whole, None, None
+        kept = _workspace(gap.prepare(self.recording, self.axis, ~clip.clipped))
+        own_noise = space.noise
+        # Samples on a limit must not pass for noise.
+        space.use_noise(kept.space.noise)
+        base = whole.fit()
+        rivals = [whole.fit([name]) for name in list(whole.gains(base))[:3]]
+        inside = len(space.rows) - len(kept.space.rows)
+        if kept.fit().explanation.chi2 + inside < min(f.explanation.chi2 for f in (base, *rivals)):
+            return whole, kept, clip
+        space.use_noise(own_noise)
+        return whole, None, None
 
-    @cached_property
-    def _clip(self) -> gap_saturation.Clip | None:
-        return gap_saturation.find(self.recording, self.axis, self._space.design, self._space.rough_noise)
-
-    @cached_property
+    @property
     def _whole(self) -> Workspace:
-        workspace = _workspace(self._space)
-        if self._clip is not None:
-            # Samples on a limit must not pass for noise.
-            workspace.space.use_noise(self._kept.space.noise)
-        return workspace
-
-    @cached_property
-    def _kept(self) -> Workspace:
-        """Without the samples on a limit."""
-        assert self._clip is not None
-        return _workspace(gap.prepare(self.recording, self.axis, ~self._clip.clipped))
+        return self._parts[0]
 
     @cached_property
     def _hum(self) -> gap_spectrum.Hum | None:
@@ -136,7 +138,7 @@ class Workbench:
             raise Problem("diagnosis.effect_not_possible", effect=effect.name)
         self._own[effect.name] = effect
         self._models = {names: model for names, model in self._models.items() if effect.name not in names}
-        for workspace in (self._whole, *([self._kept] if self._clip is not None else [])):
+        for workspace in filter(None, self._parts[:2]):
             workspace.admit(effect)
 
     def fit(self, effects: Sequence[str] = ()) -> Model:
@@ -145,16 +147,19 @@ class Workbench:
         if names not in self._models:
             if len(self._models) >= MOST_MODELS:
                 del self._models[next(iter(self._models))]
-            clip = self._clip if "saturation" in names else None
-            workspace = self._whole if clip is None else self._kept
-            fitted = workspace.fit([name for name in names if name not in BY_THEMSELVES])
+            whole, kept, clip = self._parts
+            clip = clip if "saturation" in names else None
+            fitted = (kept if kept is not None and clip is not None else whole).fit(
+                [name for name in names if name not in BY_THEMSELVES]
+            )
             self._models[names] = Model(names, fitted, clip, self._hum if "mains_hum" in names else None)
         return self._models[names]
 
     def ranked(self, effects: Sequence[str] = ()) -> dict[str, tuple[float, float]]:
         """2ΔlnL and equivalent |z| of every other effect beside base and ``effects``."""
         model = self.fit(effects)
-        workspace = self._whole if model.clip is None else self._kept
+        whole, kept, _ = self._parts
+        workspace = kept if kept is not None and model.clip is not None else whole
         freedom = {name: max(1, len(effect.linear())) for name, effect in {**library(), **self._own}.items()}
         gains = workspace.gains(model.fitted)
         return {name: (gain, float(equivalent_z(gain, freedom[name]))) for name, gain in gains.items()}

@@ -11,6 +11,7 @@ import pytest
 from calib_core.gyro_models import PRESETS
 from calib_core.pictures import decimated, spectrum
 from calib_core.problem import Problem
+from calib_core.workbench import Workbench
 from server import examples, workbench
 from server.devices import open_rig
 from server.live import decode
@@ -70,6 +71,14 @@ def test_clipped_samples_leave_the_model_with_saturation_and_the_error_with_them
     assert after["error"]["floor"] == pytest.approx(before["error"]["floor"], rel=0.05)
     limit = next(p for p in after["parameters"] if p["name"] == "saturation.V_hi")
     assert limit["value"] == pytest.approx(1.62, abs=2e-3)
+
+
+def test_a_top_speed_that_is_often_reached_is_no_limit() -> None:
+    steps = replace(examples.EXAMPLES["full_scale"], motion=(examples.STAIRS,))
+    bench = Workbench(examples.record(steps), "x")
+    floors = {names: bench.fit(names).fitted.error.floor_rms_dps for names in ((), ("scale_factor_cubic",))}
+    assert bench.fit(["saturation"]).clip is None
+    assert max(floors.values()) < 0.07
 
 
 def test_the_modelled_signal_is_the_measured_one_within_the_noise(stored: tuple[Path, dict[str, str]]) -> None:
