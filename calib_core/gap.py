@@ -271,10 +271,17 @@ def _candidates(search: Search, pool: dict[str, type[Effect]], answer: Diagnosis
             row["status"] = "not_excited"
         elif name in tested:
             row["two_delta_lnL"], row["p"] = tested[name].gain, p_value(tested[name].z)
+            row["held_out_gain"] = _unseen(search, tested[name].term)
         elif name not in BY_ITSELF and name not in chosen:
             row["status"] = "not_excited"
         rows.append(row)
     return rows
+
+
+def _unseen(search: Search, term: Term) -> float:
+    """What ``term`` takes off χ² on data not seen: of a chosen one, what it takes off beside the others."""
+    others = [t for t in search.chosen if t is not term]
+    return search.held_out(others) - search.held_out([*others, term])
 
 
 def on_grid(answer: Diagnosis) -> float:

@@ -151,6 +151,18 @@ class Gram:
         squares += np.einsum("fi,fij,fj->f", values, own, values)
         return float(squares.sum()), values / size
 
+    def scores(self, models: Ints) -> F64:
+        """(m,) what each of the models (m, p), columns beside the base, leaves of each fold fitted to the others: all
+        at once."""
+        held = np.concatenate([np.tile(np.arange(1, 1 + self.base), (len(models), 1)), models], axis=1)
+        size = self.scale[held]
+        own = self.parts[:, held[:, :, None], held[:, None, :]] / (size[:, :, None] * size[:, None, :])
+        score = self.parts[:, held, 0] / size
+        whole = self.matrix[held[:, :, None], held[:, None, :]] + 1e-9 * np.eye(held.shape[1])
+        values = np.linalg.solve(whole - own, (score.sum(axis=0) - score)[..., None])[..., 0]
+        squares = self.parts[:, 0, 0][:, None] - 2.0 * np.einsum("fmi,fmi->fm", values, score)
+        return np.asarray((squares + np.einsum("fmi,fmij,fmj->fm", values, own, values)).sum(axis=0))
+
     def _held(self, columns: Sequence[int]) -> list[int]:
         return [*range(1, 1 + self.base), *columns]
 

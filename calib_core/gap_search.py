@@ -26,8 +26,8 @@ REST = 0.1
 """Or this share of what is left: then the form is not what is meant."""
 RIVAL = 6.0
 """2ΔlnL within which two explanations cannot be told apart."""
-PLACED = 4.0
-"""2ΔlnL that a step gains by being put where noise likes it best."""
+TUNED = 4.0
+"""2ΔlnL that a time or a time constant gains by being put where noise likes it best."""
 MOST = 3
 STEP_EVERY_S, STEPS = 4.0, 40.0
 CLEAN = 1e-3
@@ -372,7 +372,7 @@ def _margin(best: Suspicion, other: Suspicion) -> float:
     answers, which are series in the same small number; and a step is at the best of many places."""
     if best.term.effect.curvature is not None and other.term.effect.curvature is not None:
         return RIVAL
-    return RIVAL + 0.5 * SHARE * best.gain + (PLACED if best.term.name == "bias_step" else 0.0)
+    return RIVAL + 0.5 * SHARE * best.gain + (TUNED if best.term.effect.nonlinear() else 0.0)
 
 
 def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:

@@ -60,7 +60,9 @@ def wandering(search: Search) -> Walk | None:
     size = np.linspace(math.log(1e-3), math.log(1e3), 61) + math.log(noise.white * 0.1)
     deviance = np.array([_deviance(search, kept, waves, math.exp(u) * deviations) for u in size])
     best = int(np.argmin(deviance))
-    if deviance[best] > min(now - RIVAL, plain - EVIDENCE) or not 0 < best < len(size) - 1:
+    # Noise that would be slower if it could speaks for the walk itself.
+    margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * MAX_CORRELATION_S else RIVAL
+    if deviance[best] > min(now - margin, plain - EVIDENCE) or not 0 < best < len(size) - 1:
         space.use_noise(was)
         return None
     h = float(size[1] - size[0])

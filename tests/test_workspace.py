@@ -6,6 +6,7 @@ import pytest
 from calib_core.condense import condense
 from calib_core.effects import Acts
 from calib_core.gap import diagnose, prepare
+from calib_core.gap_gram import Bank, Folds, Gram
 from calib_core.gap_report import to_json
 from calib_core.integral_fit import Design
 from calib_core.problem import Problem
@@ -84,3 +85,21 @@ def test_an_effect_without_its_covariate_is_refused(workspace: Workspace) -> Non
     assert "mains_hum" not in workspace.effects
     with pytest.raises(Problem, match="mains_hum"):
         workspace.fit(["mains_hum"])
+
+
+def test_many_models_are_scored_as_each_would_be() -> None:
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((4000, 6))
+    columns[:, 0] += 0.1 * columns[:, 2]
+    folds = Folds.of(np.arange(4000) * 0.01)
+    gram = Gram(Bank(folds, columns).parts, np.zeros(1))
+    scores = gram.scores(np.array([[2], [3]]))
+    fold = folds.of_time(np.arange(4000) * 0.01)
+    for model, score in zip(([1, 2], [1, 3]), scores, strict=True):
+        squares = 0.0
+        for k in range(len(folds)):
+            seen, unseen = columns[fold != k], columns[fold == k]
+            weights = np.linalg.lstsq(seen[:, model], seen[:, 0], rcond=None)[0]
+            squares += float(np.sum((unseen[:, 0] - unseen[:, model] @ weights) ** 2))
+        assert score == pytest.approx(squares, rel=1e-9)
+    assert scores[0] < scores[1]
