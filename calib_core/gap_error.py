@@ -167,6 +167,13 @@ class Explanation:
             variance += np.interp(design.averages.samples.time_s, design.readings.time_s, design.readings.variance)
             variance[design.averages.at[design.averages.at >= 0]] = 0.0
         spread = self.windows.spread(noise.white / scale, noise.ar1 / scale, noise.correlation_time_s, variance)
+        if design.readings is not None:
+            # The encoder's error at rest is one draw: a window that the rest fills in part sees it whole.
+            still = design.averages.at[design.averages.at >= 0]
+            fresh = np.flatnonzero(np.diff(still, prepend=-2) != 1)
+            last = np.append(fresh[1:], len(still)) - 1
+            seen = self.windows.resting(still[fresh], still[last] + 1) if len(still) else 0.0
+            spread = np.sqrt(spread**2 + design.readings.step_deg**2 / 12.0 * seen)
         return np.asarray(spread[self.first])
 
     def along(self) -> dict[str, F64]:

@@ -58,6 +58,18 @@ class Windows:
         view = np.lib.stride_tricks.sliding_window_view(values, self.width, axis=0)[self.first]
         return np.asarray(view @ weights * self.interval_s)
 
+    def resting(self, begin: Ints, end: Ints) -> F64:
+        """(w,) squares, summed over the rests from sample ``begin`` to before ``end`` (r,), of what an error of the
+        angle that is one throughout a rest does to each window: nothing where the window lies within."""
+        total = np.concatenate([[0.0], np.cumsum(self.slope * self.interval_s)])
+        out = np.zeros(len(self.first))
+        for a, b in zip(begin.tolist(), end.tolist(), strict=True):
+            few = slice(*np.searchsorted(self.first, [a - self.width + 1, b]))
+            first = self.first[few]
+            inside = np.clip([a - first, b - first], 0, self.width)
+            out[few] += (total[inside[1]] - total[inside[0]]) ** 2
+        return out
+
     def spread(self, white: float, ar1: float, correlation_time_s: float, angle_variance: F64) -> F64:
         """(w,) the standard deviation that noise gives each window.
 

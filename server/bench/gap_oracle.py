@@ -4,12 +4,13 @@ The oracle knows the effect's shape in this recording and the noise; only bias a
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from server.bench.gap_records import ADC_STEP_V, ENCODER_STEP_DEG, record
+from server.bench.gap_records import ADC_STEP_V, ENCODER_STEP_DEG, Record, record
 
 F64 = NDArray[np.float64]
 
@@ -26,12 +27,20 @@ def detectable(seed: int, effect: str, options: Mapping[str, Any]) -> float:
     for _ in range(4):  # not all effects grow in proportion to their strength
         seen = evidence(seed, {effect: strength}, options)
         strength *= float(np.clip(POWERED / max(seen, 1e-9), 0.05, 20.0))
+        if abs(seen / POWERED - 1.0) < 0.02:
+            break
     return strength
+
+
+@lru_cache(maxsize=2)
+def _plain(seed: int, options: tuple[tuple[str, Any], ...]) -> Record:
+    """The same recording without any effect."""
+    return record(seed, {}, **dict(options))
 
 
 def evidence(seed: int, effects: Mapping[str, float], options: Mapping[str, Any]) -> float:
     """√NCP of all that the effects do to output and encoder and that bias and scale factor do not explain."""
-    made, plain = record(seed, effects, **options), record(seed, {}, **options)
+    made, plain = record(seed, effects, **options), _plain(seed, tuple(options.items()))
     scale = float(str(made.truth["scale_factor_V_per_dps"]))
     axis = made.truth["axis"]
     white = np.hypot(options.get("white_V", 1.2e-3), ADC_STEP_V / np.sqrt(12.0)) / scale
