@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -78,9 +79,13 @@ class Outcome:
     held_out: float
     floor: float
     """RMS of the generator's own noise in the same statistic."""
-    oracle: float
-    """√NCP of the truth for one who knows its shape and the noise."""
     cpu_s: float
+
+    @cached_property
+    def oracle(self) -> float:
+        """√NCP of the truth for one who knows its shape and the noise."""
+        made = self.case.made()
+        return evidence(self.case.seed, made.effects, self.case.options) if made.effects else 0.0
 
     @property
     def truth(self) -> frozenset[str]:
@@ -134,7 +139,6 @@ def play(case: Case) -> Outcome:
         said["unknown"]["covariate"] if said["unknown"] else "",
         said["after"]["held_out_rms_dps"] if said["after"] else math.nan,
         true_floor(made),
-        evidence(case.seed, made.effects, case.options) if made.effects else 0.0,
         cpu_s,
     )
 
