@@ -152,7 +152,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         bench.fill("#reasoning", "It jumps when the rotation turns round.")
         bench.click("text=Hand in >> nth=-1")
         bench.wait_for_selector("text=Handed in at")
-        assert bench.locator(".lines li").count() == 2
+        bench.wait_for_selector(".lines li:nth-child(2):last-child >> text=Handed in: hysteresis")
         assert student.widest() <= PHONE["width"]
 
         page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # the teacher looks again
