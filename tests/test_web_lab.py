@@ -160,7 +160,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         assert page.locator(".mark").count() == 0, "marks before the reveal, where the class may look"
         page.click("text=Reveal the truth")
         page.click("text=Reveal now")
-        page.wait_for_selector(".mark.right")
+        page.wait_for_selector(".mark.right", timeout=90_000)  # the instrument first looks at the answer's recording
         with page.expect_download() as download:
             page.click("text=Results as CSV")
         download.value.save_as(tmp_path / "results.csv")
