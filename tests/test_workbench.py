@@ -22,16 +22,17 @@ FULL = (None, None)
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """A store with the examples that the tests open, and one longer record that clips, of over 22 000 samples."""
+    """A store with an example, a record of over 22 000 samples, and a short one that clips."""
     data = tmp_path_factory.mktemp("data")
-    swing = examples.SLOW
-    clipped = replace(
-        examples.EXAMPLES["full_scale"], name="clipped", seed=21, effects="saturation.V_hi:1.62",
-        motion=(swing, examples.STAIRS, examples.QUICK, swing, examples.STAIRS),
-    )  # fmt: skip
+    swing, stairs = examples.SLOW, examples.STAIRS
+    full_scale = examples.EXAMPLES["full_scale"]
+    made = {
+        "long": replace(full_scale, motion=(swing, stairs, examples.QUICK, swing, stairs)),
+        "clipped": replace(full_scale, seed=21, effects="saturation.V_hi:1.62", motion=(stairs,)),
+    }
     with Store(data) as store:
-        ids = {name: examples.made(store, name) for name in ("one_sine",)}
-        ids["clipped"] = store.recordings.add(examples.record(clipped), board="", name="clipped")
+        ids = {name: store.recordings.add(examples.record(one), board="", name=name) for name, one in made.items()}
+        ids["one_sine"] = examples.made(store, "one_sine")
     return data, ids
 
 
@@ -41,13 +42,13 @@ def fit(stored: tuple[Path, dict[str, str]], name: str, *effects: str, formulas:
 
 
 def test_an_effect_is_fitted_in_a_third_of_a_second_on_22_000_samples(stored: tuple[Path, dict[str, str]]) -> None:
-    head, columns = fit(stored, "clipped")
+    head, columns = fit(stored, "long")
     assert head["samples"] >= 22_000
     assert len(columns["time_s"]) <= 4000
     took = {}
     for effect in ("scale_factor_cubic", "dead_band", "bias_step"):
         began = time.process_time()
-        fit(stored, "clipped", effect)
+        fit(stored, "long", effect)
         took[effect] = time.process_time() - began
     assert max(took.values()) < 0.25, took
 
@@ -68,7 +69,7 @@ def test_clipped_samples_leave_the_model_with_saturation_and_the_error_with_them
     before, _ = fit(stored, "clipped")
     after, _ = fit(stored, "clipped", "saturation")
     assert after["error"]["held_out"] < 0.1 * before["error"]["held_out"]
-    assert after["error"]["floor"] == pytest.approx(before["error"]["floor"], rel=0.05)
+    assert after["error"]["floor"] == pytest.approx(before["error"]["floor"], rel=0.1)
     limit = next(p for p in after["parameters"] if p["name"] == "saturation.V_hi")
     assert limit["value"] == pytest.approx(1.62, abs=2e-3)
 
@@ -105,7 +106,7 @@ def test_failing_stretches_come_with_their_pictures_and_are_gone_with_the_cause(
 
 def test_a_stretch_is_shown_with_every_sample(stored: tuple[Path, dict[str, str]]) -> None:
     data, ids = stored
-    head, columns = decode(workbench.fit(data, ids["clipped"], "x", (), (), (20.0, 25.0), 1000, "", "en"))
+    head, columns = decode(workbench.fit(data, ids["long"], "x", (), (), (20.0, 25.0), 1000, "", "en"))
     assert head["whole"]
     assert (columns["time_s"][0], columns["time_s"][-1]) == pytest.approx((20.0, 25.0), abs=0.011)
     assert len(columns["time_s"]) in range(499, 503)

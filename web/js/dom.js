@@ -37,3 +37,15 @@ export const facts = (pairs, wide = false) =>
 export function say(place, problem) {
   place.textContent = problem ? problem.message : "";
 }
+
+/** A paragraph that says since when it waits, until it is taken out: long work must not look dead. */
+export function waiting(text) {
+  const seconds = h("span", { "aria-hidden": "true" });
+  const node = h("p", { class: "muted" }, text, seconds);
+  const began = performance.now();
+  const timer = setInterval(() => {
+    if (!node.isConnected) clearInterval(timer);
+    else seconds.textContent = ` ${Math.round((performance.now() - began) / 1000)} s`;
+  }, 1000);
+  return node;
+}

@@ -1,7 +1,7 @@
 // The workbench: compare, see, learn, add, and watch the error fall.
 
 import { api, links } from "../api.js";
-import { h, say } from "../dom.js";
+import { h, say, waiting } from "../dom.js";
 import { notebook } from "../notebook.js";
 import { page } from "../shell.js";
 import { duration, has, t } from "../text.js";
@@ -41,7 +41,7 @@ async function open(main, recording, row, signal) {
   const [seen, side, listed, cardPlace, nextPlace, keepPlace, bookPlace] = ["pictures stack", "side stack", "list stack", "panel stack about", "panel stack", "panel stack", "panel stack"]
     .map((name) => h("section", { class: name }));
   const isGuessing = h("input", { type: "checkbox", id: "guess-first", checked: localStorage.getItem(GUESS_FIRST) === "yes", onchange: () => { localStorage.setItem(GUESS_FIRST, isGuessing.checked ? "yes" : "no"); guess = null; refresh(); } });
-  const suspectsPlace = h("div", {}, h("p", { class: "muted" }, t("workbench.looking")));
+  const suspectsPlace = h("div", {}, waiting(t("workbench.looking")));
   const verdict = h("p", { class: "verdict" });
   listed.classList.add("panel");
   listed.append(

@@ -2,7 +2,7 @@
 
 import { api } from "../api.js";
 import { chart } from "../chart.js";
-import { h, say } from "../dom.js";
+import { h, say, waiting } from "../dom.js";
 import { duration, t } from "../text.js";
 
 const ASK_MS = 400;
@@ -26,7 +26,7 @@ export function experimentPanel(place, { ask, run, done, rig }) {
   async function propose() {
     clear();
     find.disabled = true;
-    told.replaceChildren(h("p", { class: "muted" }, t("workbench.next.finding")));
+    told.replaceChildren(waiting(t("workbench.next.finding")));
     try {
       const experiment = await api.proposeExperiment(ask());
       const path = await api.experimentMotion(experiment.id);

@@ -32,7 +32,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
     waiting: t("workbench.loading"), onZoom,
     series: [
       { name: t("chart.measured"), role: "measured", draw: points ? "points" : "line" },
-      { name: t("workbench.modelled"), role: "model", draw: "dash", joined: true },
+      { name: t("workbench.modelled"), role: "model", draw: "dash" },
     ],
   });
   const residual = chart(traces, {
@@ -54,7 +54,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
       if (shown === of) drawSignal(part);
     }, DETAIL_MS);
   }
-  const drawSignal = ({ columns: c }) => overlay.set([c.time_s, c.measured, c.modelled]);
+  const drawSignal = ({ columns: c }) => overlay.set([c.time_s, ...broken(c.time_s, c.measured, c.modelled)]);
 
   function multiple(along) {
     const name = along.kind === "time" ? t("workbench.along_time") : alongName(along);
@@ -96,9 +96,9 @@ export function pictures(place, { unit, points, detail, pointed }) {
     const { columns: c, along } = shown;
     const failures = isHiding ? [] : shown.failures;
     const y = reach(c, along);
-    residual.set([c.window_s, c.residual, compared ? compared.columns.residual : new Array(c.window_s.length).fill(null)], {
+    residual.set([c.window_s, ...broken(c.window_s, c.residual), compared ? compared.columns.residual : new Array(c.window_s.length).fill(null)], {
       band: { x: c.window_s, half: c.spread.map((s) => 2 * s) }, limits: [-y, y],
-      shade: failures.filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
+      shade: failures.slice(0, 1).filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
     });
     residual.rename(compared ? t("workbench.residual_two") : t(points ? "workbench.residual_points" : "workbench.residual"), t("chart.residual"));
     sentence.textContent = isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits");
@@ -109,10 +109,12 @@ export function pictures(place, { unit, points, detail, pointed }) {
       const failing = failures.find((f) => f.covariate === one.covariate);
       plot.set(merged(at("at"), at("residual"), at("middle"), at("mean")), {
         band: { x: at("middle"), half: at("sigma").map((s) => 2 * s) }, limits: [-y, y],
-        shade: failing ? [[failing.from, failing.to]] : [],
+        shade: failing && failing === failures[0] ? [[failing.from, failing.to]] : [],
       });
       says.textContent = isHiding ? "" : failing ? failing.sentence : t("workbench.no_failure");
       figure.classList.toggle("failing", Boolean(failing));
+      // What fails in one picture shows faintly in most others: the surest leads.
+      figure.classList.toggle("leads", Boolean(failing) && failing === failures[0]);
     }
     if (points) return;
     if (!spectrumPlace.isConnected) { grid.append(spectrumPlace); spectrumPlace.append(h("p", { class: "small muted" }, t("workbench.spectrum_says"))); }
@@ -121,7 +123,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
 
   return {
     signal({ columns }) {
-      overlay.set([columns.time_s, columns.measured, new Array(columns.time_s.length).fill(null)]);
+      overlay.set([columns.time_s, ...broken(columns.time_s, columns.measured), new Array(columns.time_s.length).fill(null)]);
     },
     /** A fit, and beside its residual that of another model where two are compared. */
     fit(fit, other = null) {
@@ -136,6 +138,13 @@ export function pictures(place, { unit, points, detail, pointed }) {
       for (const [name, { here }] of multiples) here.setAttribute("aria-pressed", String(name === covariate));
     },
   };
+}
+
+/** The columns without a line over a pause: where the next instant is far, nothing is drawn to it. */
+function broken(x, ...columns) {
+  const steps = Float64Array.from(x.subarray(1), (value, i) => value - x[i]).sort();
+  const far = Math.max(1, 5 * (steps[steps.length >> 1] ?? 0));
+  return columns.map((column) => Array.from(column, (value, i) => (i && x[i] - x[i - 1] > far ? null : value)));
 }
 
 /** Points and a curve with places of its own in one table, as a chart wants them. */
