@@ -1,6 +1,7 @@
 """The servo half of `bench bus`: how often the bus is read, what that costs, how fast a stop is, and whether the
 emulated bench and the twin give one board the same certificate."""
 
+import logging
 import math
 import time
 from collections.abc import Iterator
@@ -92,6 +93,7 @@ def stopping() -> Iterator[Row]:
 
 def faults(count: int) -> Iterator[Row]:
     """Every kind of HARDWARE's faults, `count` times: wrong readings, hung runs, torque left on, wrong reasons."""
+    logging.getLogger("server.devices").setLevel(logging.ERROR)  # it warns of each fault, and is right to
     with _bench() as (bench, table):
         campaign = Campaign(table, bench.bus, bench.plant, seed=SEED)
         for kind in KINDS:

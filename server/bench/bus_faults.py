@@ -161,8 +161,8 @@ class Campaign:
         servo = self._rng.choice((1, 2))
         time.sleep(self._rng.uniform(0.0, 0.03))
         match outcome.kind:
-            case "overload":
-                self.bus.fault("overload", servo)
+            case "overload":  # a servo goes on saying it: one such reply may be lost on a busy machine
+                self.bus.fault("overload", servo, 5)
             case "port_gone":
                 self.bus.unplug()
             case "silent":
@@ -182,6 +182,7 @@ class Campaign:
             outcome.ended += outcome.kind != "silent"
         elif ended and ended[0].code != ENDING[outcome.kind]:
             outcome.surprises.append(str(ended[0]))
+        self.bus.mend()
         if outcome.kind == "port_gone":
             self.bus.plug()
         alive = [n for n in (1, 2) if outcome.kind != "silent" or n != servo]
