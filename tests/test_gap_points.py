@@ -141,7 +141,7 @@ def test_the_command_takes_points_and_tells_each_board_and_axis(
     assert (said["recording"]["board"], said["recording"]["samples"]) == ("2", 248)
     codes = [limit["code"] for limit in said["limits"]]
     assert "diagnosis.limit.moved" in codes
-    assert "either" in said["sentence"]
+    assert "one of" in said["sentence"]
     assert " deg;" in said["sentence"]
     assert cli.main(["diagnose", str(file)]) == 0
     assert "board 2, axis x, 248 readings" in capsys.readouterr().out
