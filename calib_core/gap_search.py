@@ -240,10 +240,10 @@ class Search:
             ):
                 del rivals[0]
             rest = self.chi2(self.chosen)
-            share = SHARE_RATE if self.space.design.reference == "rate" else SHARE
-            if not rivals or self._beside_refined(rivals[0].term, rest) < min(
-                share * (self.chi2([]) - rest), REST * rest
-            ):
+            explained = self.chi2([]) - rest
+            rated = self.space.design.reference == "rate"
+            needed = SHARE_RATE * explained if rated else min(SHARE * explained, REST * rest)
+            if not rivals or self._beside_refined(rivals[0].term, rest) < needed:
                 return
             simplest = min((s for s in rivals if rivals[0].gain - s.gain < 1.0), key=lambda s: len(s.term.setting))
             self.findings.append(Finding(simplest, rivals, self.threshold))

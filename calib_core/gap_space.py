@@ -27,6 +27,7 @@ F64 = NDArray[np.float64]
 OVERSTATED = 2.0
 FEIGNED_STEPS = 0.014
 """A shape of this size, RMS in encoder steps, may come from the codes themselves."""
+FINER = 8
 LATE = 0.01
 """Lateness below this share of a sampling interval is as good as none."""
 REMEMBERED = 24
@@ -270,7 +271,10 @@ class Space:
 
         def answer(tau: float) -> F64:
             if effect.curvature == 0.0:
-                return replace(c, memory={}).lagged(c.rate_dps, tau, "")
+                # Between samples the rate is curved, and a lag of less than a sample feels it.
+                within = np.arange(FINER * (len(c.time_s) - 1) + 1) / FINER
+                fine = self._curve(np.interp(within, np.arange(len(c.time_s)), c.time_s))
+                return replace(c, memory={}, interval_s=c.interval_s / FINER).lagged(fine, tau, "")[::FINER]
             return self._curve(c.time_s - tau)
 
         little = 0.02 * abs(tau)

@@ -64,7 +64,7 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
         block = free.T @ free
         inverse = np.linalg.pinv(block, rcond=1e-6, hermitian=True)
         value = inverse @ (free.T @ residual)
-        gain = float(value @ np.linalg.solve(inverse + np.diag(_slack(space, columns)), value))
+        gain = float(value @ np.linalg.pinv(inverse + np.diag(_slack(space, columns)), 1e-12, hermitian=True) @ value)
         z = float(equivalent_z(gain, int(np.linalg.matrix_rank(block, rtol=1e-6, hermitian=True))))
         names = tuple(f"c{k}" for k in range(columns.shape[1]))
         term = Term(Unknown, (), names, columns, np.zeros(len(names)))

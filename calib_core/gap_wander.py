@@ -28,6 +28,7 @@ NEAR_LIMIT = 0.5
 """Of the longest correlation that noise may have."""
 FASTEST_S, MOST = 4.0, 60
 """The series ends at half waves of this length: what is faster is noise."""
+STRONG, FORM = 300.0, 0.3
 EVIDENCE = 16.0
 """2ΔlnL over noise that does not wander."""
 
@@ -62,6 +63,8 @@ def wandering(search: Search) -> Walk | None:
     best = int(np.argmin(deviance))
     # Noise that would be slower if it could speaks for the walk itself.
     margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * MAX_CORRELATION_S else RIVAL
+    # Of what strong slow shapes explain, a share is always their form, which a walk mends without being one.
+    margin += FORM * max(plain - now - STRONG, 0.0)
     if deviance[best] > min(now - margin, plain - EVIDENCE) or not 0 < best < len(size) - 1:
         space.use_noise(was)
         return None

@@ -165,12 +165,12 @@ def one_rate_plan(axis: str) -> Motion:
 
 
 def _lag(signal: F64, tau_s: float) -> F64:
-    """First-order lag at 1 kHz of a signal that is a straight line between samples; starts settled."""
+    """First-order lag at 1 kHz, exact for a signal that is a straight line between samples; starts settled."""
     from scipy.signal import lfilter
 
     a = np.exp(-1 / (FINE_HZ * tau_s))
-    half = (1 - a) / 2
-    return np.asarray(lfilter([half, half], [1, -a], signal, zi=[(1 - half) * signal[0]])[0])
+    late = tau_s * FINE_HZ * (1 - a)
+    return np.asarray(lfilter([1 - late, late - a], [1, -a], signal, zi=[late * signal[0]])[0])
 
 
 def _direction(rate: F64) -> F64:
