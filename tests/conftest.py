@@ -1,6 +1,15 @@
-"""Makes the tests' own helpers importable."""
+"""Makes the tests' own helpers importable, and begins with the files that take longest."""
 
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+LONG = ("test_web_", "test_bench", "test_gap", "test_batch", "test_compose", "test_bus", "test_worker", "test_style")
+"""Browsers, emulators, campaigns: begun last, one of them would be all that still runs."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: not item.path.name.startswith(LONG))
