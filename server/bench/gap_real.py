@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "real"
 ROW_S = 0.01
-"""The instrument's own rows, over which faster samples are averaged. METHOD does not say whether its errors are those of
+"""The instrument's own rows, over which faster samples are averaged. METHOD does not say whether its errors are of
 single samples; its base on x, 28.6, is neither's (30.1 and 29.8 here). So the limit is held against the means, and the
 error of single samples stands beside it."""
 TURNED_S = 3129.7
