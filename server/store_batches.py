@@ -3,12 +3,13 @@
 import json
 import secrets
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from sqlite_utils import Database
+from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
 from server.store_db import Connection, Row, dumps, migrations, now, page
+
+if TYPE_CHECKING:
+    from sqlite_utils import Database
 
 SELECT = "select rowid as at, * from batches"
 OPEN = "status in ('queued', 'running')"
@@ -16,7 +17,7 @@ JSON_COLUMNS = ("error", "axes", "warnings")
 
 
 @migrations(name="0011_batches")
-def _batches(db: Database) -> None:
+def _batches(db: "Database") -> None:
     db.table("batches").create(
         {
             "id": str, "key": str, "fingerprint": str, "name": str, "status": str, "gyro_model": str, "spec": str,

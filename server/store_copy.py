@@ -9,8 +9,6 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from sqlite_utils import Database
-
 from calib_core.problem import Problem
 from server.store_db import BUSY_S, FILE, Connection, migrations, now, told
 
@@ -67,7 +65,7 @@ def restore(file: Path, data: Path) -> Path | None:
         if running:
             raise Problem("restore.run_on", run=running[0]["id"])
         with told(there.path), closing(_opened(file)) as copy:
-            copy.backup(there.db.conn)
+            copy.backup(there.raw)
         # A copy from an older version gets what came since.
         with there.write():
             migrations.apply(there.db)
@@ -86,6 +84,5 @@ def _check(copy: sqlite3.Connection, path: Path) -> None:
     tables = {name for (name,) in copy.execute("select name from sqlite_master where type = 'table'")}
     if found != "ok" or "certificates" not in tables:
         raise Problem("store.not_a_store", path=str(path), reason=found)
-    ours = {migration.name for migration in migrations.pending(Database(memory=True))}
-    if {migration.name for migration in migrations.applied(Database(copy))} - ours:
+    if migrations.applied(copy) - migrations.steps.keys():
         raise Problem("store.newer", path=str(path))

@@ -4,25 +4,66 @@ import json
 import re
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-from sqlite_utils import Database, Migrations
+from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
+
+if TYPE_CHECKING:
+    from sqlite_utils import Database
 
 FILE = "gyrobench.sqlite"
 BUSY_S = 10.0
 Row = dict[str, Any]
+Step = Callable[["Database"], None]
 
-migrations = Migrations("gyrobench")
+MIGRATIONS = "gyrobench"
+
+
+class Schema:
+    """The numbered steps that make the tables, applied by sqlite-utils.
+
+    That package is loaded where there is a step to apply or something to write: its command line comes with it, and a
+    start that finds all in place need not wait for that.
+    """
+
+    def __init__(self) -> None:
+        self.steps: dict[str, Step] = {}
+
+    def __call__(self, *, name: str) -> "Callable[[Step], Step]":
+        def kept(step: "Step") -> "Step":
+            if name in self.steps:
+                raise ValueError(f"two migrations are called {name}")
+            self.steps[name] = step
+            return step
+
+        return kept
+
+    def applied(self, raw: sqlite3.Connection) -> set[str]:
+        """The names of the steps that this file has had."""
+        if not raw.execute("select 1 from sqlite_master where name = '_sqlite_migrations'").fetchone():
+            return set()
+        found = raw.execute("select name from _sqlite_migrations where migration_set = ?", [MIGRATIONS])
+        return {name for (name,) in found}
+
+    def apply(self, db: "Database") -> None:
+        from sqlite_utils import Migrations
+
+        set_of_steps = Migrations(MIGRATIONS)
+        for name, step in self.steps.items():
+            set_of_steps(name=name)(step)
+        set_of_steps.apply(db)
+
+
+migrations = Schema()
 
 
 @migrations(name="0001_session")
-def _session(db: Database) -> None:
+def _session(db: "Database") -> None:
     db.table("boards").create({"id": str, "gyro_model": str, "note": str, "created_at": str}, pk="id")
     db.table("gyro_models").create({"id": str, "body": str, "created_at": str}, pk="id")
     db.table("recordings").create(
@@ -63,12 +104,12 @@ def _session(db: Database) -> None:
 
 
 @migrations(name="0002_rig_records")
-def _rig_records(db: Database) -> None:
+def _rig_records(db: "Database") -> None:
     db.table("rig_records").create({"id": int, "kind": str, "body": str, "created_at": str}, pk="id")
 
 
 @migrations(name="0003_experiments")
-def _experiments(db: Database) -> None:
+def _experiments(db: "Database") -> None:
     db.table("experiments").create(
         {"id": str, "recording": str, "axis": str, "effects": str, "proposal": str, "run": str, "result": str,
          "created_at": str},
@@ -78,7 +119,7 @@ def _experiments(db: Database) -> None:
 
 
 @migrations(name="0004_notebooks")
-def _notebooks(db: Database) -> None:
+def _notebooks(db: "Database") -> None:
     db.table("notebooks").create({"id": str, "title": str, "author": str, "lab": str, "created_at": str}, pk="id")
     db.table("notebook_lines").create(
         {"notebook": str, "n": int, "at": str, "step": str, "body": str},
@@ -93,7 +134,7 @@ def _notebooks(db: Database) -> None:
 
 
 @migrations(name="0005_lab")
-def _lab(db: Database) -> None:
+def _lab(db: "Database") -> None:
     db.table("lab_exercises").create(
         {"code": str, "key": str, "title": str, "axis": str, "truth": str, "starter": str, "created_at": str,
          "revealed_at": str},
@@ -116,12 +157,12 @@ def _lab(db: Database) -> None:
 
 
 @migrations(name="0010_owners")
-def _owners(db: Database) -> None:
+def _owners(db: "Database") -> None:
     db.table("runs").add_column("owner", str)
 
 
 @migrations(name="0013_search")
-def _search(db: Database) -> None:
+def _search(db: "Database") -> None:
     """What is looked for among 10^5: a board's certificates and recordings, a recording that is here already, and the
     words of a certificate, so that a search reads an index and not the certificates."""
     for table, columns in (
@@ -143,47 +184,54 @@ class Connection:
         try:
             data.mkdir(parents=True, exist_ok=True)
             with told(self.path):
-                raw = sqlite3.connect(self.path, timeout=BUSY_S, check_same_thread=False)
-                self.db = Database(raw)
-                self.db.enable_wal()
-                self.db.execute("pragma synchronous = normal")
-                self.db.execute("pragma foreign_keys = on")
-                if migrations.pending(self.db):
+                self.raw = sqlite3.connect(self.path, timeout=BUSY_S, check_same_thread=False)
+                for pragma in ("journal_mode = wal", "synchronous = normal", "foreign_keys = on"):
+                    self.raw.execute(f"pragma {pragma}")
+                if migrations.steps.keys() - migrations.applied(self.raw):
                     # Another process may open a new file at the same moment: look again inside the transaction.
                     with self.write():
                         migrations.apply(self.db)
         except OSError as error:
             raise Problem("store.cannot_open", path=str(data), reason=error.strerror or str(error)) from error
 
-    def rows(self, sql: str, parameters: Sequence[object] = ()) -> list[Row]:
+    @cached_property
+    def db(self) -> "Database":
+        """The same connection in sqlite-utils' hands, for whoever writes."""
+        from sqlite_utils import Database
+
+        return Database(self.raw)
+
+    def rows(self, sql: str, parameters: Sequence[Any] = ()) -> list[Row]:
         with self._lock, told(self.path):
-            return list(self.db.query(sql, parameters))
+            found = self.raw.execute(sql, parameters)
+            names = [column[0] for column in found.description]
+            return [dict(zip(names, row, strict=True)) for row in found]
 
     @contextmanager
-    def write(self, *, durable: bool = False) -> Iterator[Database]:
+    def write(self, *, durable: bool = False) -> "Iterator[Database]":
         """One transaction, all or nothing; ``durable`` waits until the disk has it (synchronous FULL)."""
         with self._lock, told(self.path):
-            if self.db.conn.in_transaction:
+            if self.raw.in_transaction:
                 yield self.db
                 return
             if durable:
-                self.db.execute("pragma synchronous = full")
+                self.raw.execute("pragma synchronous = full")
             try:
                 # Immediate, because a reader that turns writer is refused at once where another writes.
-                self.db.execute("begin immediate")
+                self.raw.execute("begin immediate")
                 try:
                     yield self.db
-                    self.db.execute("commit")
+                    self.raw.execute("commit")
                 except BaseException:
-                    self.db.rollback()
+                    self.raw.rollback()
                     raise
             finally:
                 if durable:
-                    self.db.execute("pragma synchronous = normal")
+                    self.raw.execute("pragma synchronous = normal")
 
     def close(self) -> None:
         with self._lock:
-            self.db.close()
+            self.raw.close()
 
 
 @contextmanager

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote
 
-from sqlite_utils import Database
-
 from calib_core.problem import Problem
 from server.store_db import FILE, Connection, Row, dumps, migrations, now
 
 if TYPE_CHECKING:
+    from sqlite_utils import Database
+
     from calib_core.effects import Effect
     from calib_core.formula import UserEffect
 
@@ -20,7 +20,7 @@ MOST = 100
 
 
 @migrations(name="0008_effects")
-def _effects(db: Database) -> None:
+def _effects(db: "Database") -> None:
     db.table("effects").create({"name": str, "body": str, "note": str, "created_at": str}, pk="name")
 
 

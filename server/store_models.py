@@ -6,20 +6,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlite_utils import Database
-
 from calib_core.problem import Problem
 from server import __version__
 from server.store_db import Connection, Row, dumps, like, migrations, now, page
 
 if TYPE_CHECKING:
+    from sqlite_utils import Database
+
     from calib_core.compensation import Compensation
 
 SELECT = "select rowid as at, * from models"
 
 
 @migrations(name="0009_models")
-def _models(db: Database) -> None:
+def _models(db: "Database") -> None:
     columns = {"id": str, "name": str, "board": str, "recording": str, "axis": str, "body": str, "created_at": str}
     db.table("models").create(columns, pk="id", foreign_keys=[("recording", "recordings", "id")])
 

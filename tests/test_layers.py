@@ -24,6 +24,8 @@ LAZY = {
     "nidaqmx",
     "grpc",
     "cryptography",
+    "sqlite_utils",
+    "pydantic.v1.main",
     "calib_core.effects",
     "calib_core.experiment",
     "calib_core.gap",

@@ -110,9 +110,10 @@ def test_a_certificate_cannot_be_changed_even_by_hand(store: Store, tmp_path: Pa
 
 def test_a_certificate_is_on_disk_when_it_is_issued_and_samples_need_not_wait(store: Store) -> None:
     said: list[str] = []
-    with store.connection.db.tracer(lambda sql, _: said.append(sql)):
-        recording(store, blocks=2)
-        store.issue_certificate(content("a"))
+    store.connection.raw.set_trace_callback(said.append)
+    recording(store, blocks=2)
+    store.issue_certificate(content("a"))
+    store.connection.raw.set_trace_callback(None)
     begun = [i for i, sql in enumerate(said) if sql == "begin immediate"]
     full = [i for i, sql in enumerate(said) if sql == "pragma synchronous = full"]
     assert len(begun) == 4, "one transaction for the recording, each block, and the certificate"
@@ -144,10 +145,11 @@ def test_a_recording_that_nobody_sealed_is_counted_as_it_stands(store: Store) ->
 @pytest.mark.parametrize("wanted", [{"board": "LPY-1"}, {"q": "LPY"}, {"cursor": "7"}])
 def test_a_list_of_certificates_reads_indexes_and_never_all_of_the_table(store: Store, wanted: dict[str, str]) -> None:
     store.issue_certificate(content("a"))
-    asked: list[tuple[str, Any]] = []
-    with store.connection.db.tracer(lambda sql, values: asked.append((sql, values))):
-        store.certificates.find(**wanted)
-    (plan,) = [store.connection.rows(f"explain query plan {sql}", values or ()) for sql, values in asked]
+    asked: list[str] = []
+    store.connection.raw.set_trace_callback(asked.append)
+    store.certificates.find(**wanted)
+    store.connection.raw.set_trace_callback(None)
+    (plan,) = [store.connection.rows(f"explain query plan {sql}") for sql in asked]
     steps = [row["detail"] for row in plan if row["detail"].startswith("SCAN certificates")]
     assert all("USING COVERING INDEX" in step for step in steps), plan
 

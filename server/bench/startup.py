@@ -32,7 +32,7 @@ def run(*, quick: bool) -> list[Row]:
     ]  # fmt: skip
 
 
-def _cpu(script: str, environment: dict[str, str]) -> float:
+def _cpu(script: str, environment: dict[str, str] | None = None) -> float:
     """CPU seconds of a fresh interpreter, its own start included."""
     command = [sys.executable, "-c", script]
     return float(subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout)
