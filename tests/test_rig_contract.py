@@ -19,7 +19,7 @@ from calib_core.sequence import Move, Wave, make_plan
 from calib_core.twin import HOST_EPOCH_S, Plant, board_truth
 from server.devices import DeviceError, open_rig
 from server.devices.clock import ClockRelation
-from server.devices.protocols import Samples
+from server.devices.protocols import Readings, Samples
 from server.devices.rig import Rig
 from server.devices.twin_rig import TwinDaq, TwinTable
 from server.engine import record
@@ -289,6 +289,28 @@ def test_a_rig_works_again_once_its_fault_is_mended() -> None:
     rig.begin()
     assert len(rig.read(0.1).columns["time_s"]) == 10
     assert all(part["ok"] for part in rig.status())
+
+
+@pytest.mark.parametrize("readings_per_s", [60, 100, 111, 180])
+def test_each_row_has_a_reading_where_there_are_enough(readings_per_s: int) -> None:
+    rig, table, _, _ = twin()
+    read = table.read
+
+    def more() -> dict[str, Readings]:
+        """The same motion, read at another rate."""
+        taken = {}
+        for axis, seen in read().items():
+            times = (
+                np.arange(np.ceil(seen.time_s[0] * readings_per_s), seen.time_s[-1] * readings_per_s) / readings_per_s
+            )
+            taken[axis] = Readings(times, np.interp(times, seen.time_s, seen.angle_deg))
+        return taken
+
+    rig.begin()
+    table.read = more  # type: ignore[method-assign]
+    seen = np.concatenate([rig.read(0.2).columns["x_position_time_s"] for _ in range(50)])
+    assert np.isfinite(seen).mean() == pytest.approx(min(1.0, readings_per_s / 100.0), abs=0.06)
+    assert (np.diff(seen[np.isfinite(seen)]) > 0).all()
 
 
 def test_what_waited_while_nobody_read_comes_before_the_next_motion() -> None:

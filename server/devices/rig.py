@@ -72,15 +72,22 @@ class _Shaft:
 
     def rows(self, first_s: float, n: int) -> tuple[F64, F64]:
         """Readings as two columns (n,) for rows that start at `first_s`: at most one a row, each in its own or the
-        next free one, within two; what belongs to later rows is kept."""
+        next free one, within two; one that finds none is left out, what belongs to later rows is kept."""
         own = np.maximum(np.floor((self.time_s - first_s) / ROW_S).astype(np.int64), 0)
-        order = np.arange(len(own))
-        row = np.maximum.accumulate(own - order) + order if len(own) else own
-        near, now = row - own <= 2, row < n
+        row, kept = own, np.arange(len(own))
+        if (np.diff(own) < 1).any():
+            free, placed = 0, []
+            for k, wanted in enumerate(own.tolist()):
+                if (taken := max(wanted, free)) - wanted <= 2:
+                    placed.append((k, taken))
+                    free = taken + 1
+            kept, row = np.array(placed).T
+        now = row < n
         angle, time = np.full(n, np.nan), np.full(n, np.nan)
-        angle[row[near & now]] = np.round(self.angle_deg[near & now], 4)
-        time[row[near & now]] = np.round(self.time_s[near & now], 6)
-        self.time_s, self.angle_deg = self.time_s[~now], self.angle_deg[~now]
+        angle[row[now]] = np.round(self.angle_deg[kept[now]], 4)
+        time[row[now]] = np.round(self.time_s[kept[now]], 6)
+        later = kept[~now]
+        self.time_s, self.angle_deg = self.time_s[later], self.angle_deg[later]
         return angle, time
 
 
