@@ -26,7 +26,7 @@ function estimateRows(result) {
       { n: expanded == null ? "–" : `± ${fixed(expanded * factor, decimals(expanded * factor) ?? 4)}` },
       { n: fixed(beside(result)[key] * factor, 4) },
       { n: printed == null ? "–" : fixed(printed * factor, 2) },
-      { n: percent == null ? "–" : `${signed(percent, 1)} %` },
+      { n: percent == null ? "–" : `${signed(percent, 1)}\u00a0%` },
     ];
   });
 }
