@@ -59,8 +59,4 @@ class Certificates:
             words = " or ".join(f"{column} like ? escape '\\'" for column in ("number", "board", "operator"))
             where.append(f"rowid in ({found} where {words})")
             values += [like(q)] * 3
-        for column, wanted in (("board", board), ("recording", recording)):
-            if wanted:
-                where.append(f"{column} = ?")
-                values.append(wanted)
-        return page(self._at, SELECT, where, values, limit, cursor)
+        return page(self._at, SELECT, where, values, limit, cursor, board=board, recording=recording)

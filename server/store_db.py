@@ -280,9 +280,14 @@ def page(
     parameters: Sequence[object],
     limit: int,
     cursor: str | None,
+    **equal: str,
 ) -> tuple[list[Row], str | None]:
-    """Rows newest first, at most ``limit``, and the cursor of the next page; ``select`` names rowid as "at"."""
-    conditions, values = list(where), list(parameters)
+    """Rows newest first, at most ``limit``, and the cursor of the next page; ``select`` names rowid as "at".
+
+    ``equal``: columns and the value that is wanted of each; nothing wanted leaves the column out.
+    """
+    wanted = {column: value for column, value in equal.items() if value}
+    conditions, values = [*where, *(f"{column} = ?" for column in wanted)], [*parameters, *wanted.values()]
     if cursor is not None:
         if not re.fullmatch(CURSOR_PATTERN[1:-1], cursor):
             raise Problem("request.cursor", given=cursor)

@@ -54,11 +54,7 @@ class Models:
         if q:
             where.append("(name like ? escape '\\' or board like ? escape '\\' or id = ?)")
             values += [like(q), like(q), q]
-        for column, wanted in (("board", board), ("recording", recording)):
-            if wanted:
-                where.append(f"{column} = ?")
-                values.append(wanted)
-        rows, following = page(self._at, SELECT, where, values, limit, cursor)
+        rows, following = page(self._at, SELECT, where, values, limit, cursor, board=board, recording=recording)
         return [_shown(row) for row in rows], following
 
     def delete(self, model: str) -> None:

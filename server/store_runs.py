@@ -59,11 +59,7 @@ class Runs:
         if q:
             where.append("(id = ? or " + " or ".join(f"{text} like ? escape '\\'" for text in SEARCHED) + ")")
             values += [q, *[like(q)] * len(SEARCHED)]
-        for column, wanted in (("board", board), ("status", status)):
-            if wanted:
-                where.append(f"{column} = ?")
-                values.append(wanted)
-        rows, following = page(self._at, SELECT, where, values, limit, cursor)
+        rows, following = page(self._at, SELECT, where, values, limit, cursor, board=board, status=status)
         return [_shown(row) for row in rows], following
 
     def start(self, run: str) -> None:

@@ -1,7 +1,9 @@
-"""Makes the tests' own helpers importable, and begins with the files that take longest."""
+"""Makes the tests' own helpers importable, lends a browser, and begins with the files that take longest."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,3 +15,11 @@ LONG = ("test_web_", "test_bench", "test_gap", "test_batch", "test_compose", "te
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.path.name.startswith(LONG))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from browser import chromium
+
+    with chromium() as browser:
+        yield browser

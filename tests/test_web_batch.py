@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serving
+from browser import PHONE, Server, Window, serving
 from recordings import to_parquet
 from sessions import session_recording
 
@@ -42,12 +42,6 @@ def certified(data: Path) -> None:
                 issued = batch_work.keep(store, found, row["name"])
                 facts = {name: issued[name] for name in ("board", "verdict", "axes", "warnings")}
                 store.batches.end(row["id"], "done", certificate=issued["number"], **facts)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 def test_each_board_has_its_row_and_its_place_in_the_fleet(browser: Any, server: Server) -> None:

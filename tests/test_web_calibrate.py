@@ -5,19 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serving
+from browser import PHONE, Server, Window, serving
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with serving(tmp_path_factory.mktemp("data")) as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

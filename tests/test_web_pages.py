@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, chromium, serious, serving
+from browser import PHONE, Server, Window, serious, serving
 
 PAGES = (
     "/",
@@ -28,12 +28,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
             server.wait_idle()
         server.call("GET", "/thesis", seconds=120)  # computed once; its page then comes as soon as the others
         yield server
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

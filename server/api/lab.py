@@ -14,10 +14,8 @@ from server.api import models
 from server.api.common import Cursor, Here, Language, Limit, Services
 from server.api.notebooks import Effects, Name, Numbers, Text
 from server.problems import declared
-from server.store_lab import CODE_LENGTH, LETTERS
 
 router = APIRouter(prefix="/lab", tags=["lab"])
-CODE_PATTERN = f"^[{LETTERS}]{{{CODE_LENGTH}}}$"
 
 Confidence = Annotated[int, Field(ge=0, le=100, description="%")]
 Motions = Annotated[list[Numbers], Field(min_length=1, max_length=12)]

@@ -9,7 +9,6 @@ from calib_core.problem import Problem
 from server import texts
 
 FORMATS = ("pdf", "csv", "json")
-MEDIA_TYPES = {"pdf": "application/pdf", "csv": "text/csv; charset=utf-8", "json": "application/json"}
 
 
 def warning_sentence(warning: Mapping[str, Any], lang: str = "en") -> str:
