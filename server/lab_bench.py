@@ -198,6 +198,7 @@ def rehearse(hidden: Mapping[str, Any]) -> None:
 def run(data: Path, code: str, student: str, motion: Motion, joins: str | None, restart: bool) -> str:
     """A student's run, kept as a recording – joined to an earlier one where asked; gives the recording's id."""
     from server.store import Store
+    from server.store_recordings import LAB
 
     with Store(data) as store:
         hidden, known = store.lab.truth(code), store.lab.student(code, student)
@@ -216,7 +217,7 @@ def run(data: Path, code: str, student: str, motion: Motion, joins: str | None, 
             numbers, span_s = [*hand["numbers"], number], hand["begin_s"]
         name = f"LAB-{code} {'+'.join(map(str, numbers))}"
         with store.connection.write():
-            kept = store.recordings.add(made, board=f"LAB-{code}", name=name, source="lab")
+            kept = store.recordings.add(made, board=f"LAB-{code}", name=name, source=LAB)
             store.lab.keep_run(
                 student, kept, numbers=numbers, motion=motion, begin_s=span_s, end_s=end_s,
                 run_s=end_s - begin_s, restart=restart, pause_s=BETWEEN_S,

@@ -24,7 +24,9 @@ class Boards:
         select = (
             "select rowid as at, *, (select count(*) from runs where runs.board = boards.id) as runs, "
             "(select count(*) from certificates where certificates.board = boards.id) as certificates, "
-            "(select max(created_at) from runs where runs.board = boards.id) as last_run_at from boards"
+            "(select max(created_at) from runs where runs.board = boards.id) as last_run_at, "
+            "(select id from recordings where recordings.board = boards.id order by rowid desc limit 1) "
+            "as last_recording from boards"
         )
         where = ["(id like ? escape '\\' or note like ? escape '\\')"] if q else []
         return page(self._at, select, where, [like(q)] * 2 if q else [], limit, cursor)

@@ -7,6 +7,7 @@ from typing import Any
 
 from calib_core.problem import Problem
 from server.store_db import Connection, Row, dumps, now, page
+from server.store_recordings import OPEN
 
 SELECT = "select rowid as at, * from experiments"
 JSON_COLUMNS = ("effects", "proposal", "result")
@@ -35,8 +36,8 @@ class Experiments:
         return row
 
     def find(self, *, recording: str = "", limit: int = 50, cursor: str | None = None) -> tuple[list[Row], str | None]:
-        where = ["recording = ?"] if recording else []
-        rows, following = page(self._at, SELECT, where, [recording] if recording else [], limit, cursor)
+        where = [] if recording else [OPEN]
+        rows, following = page(self._at, SELECT, where, [], limit, cursor, recording=recording)
         return [_shown(row) for row in rows], following
 
     def begin(self, experiment: str, run: str) -> None:

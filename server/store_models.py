@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from calib_core.problem import Problem
 from server import __version__
 from server.store_db import Connection, Row, dumps, like, migrations, now, page
+from server.store_recordings import OPEN
 
 if TYPE_CHECKING:
     from sqlite_utils import Database
@@ -50,7 +51,7 @@ class Models:
     def find(
         self, *, q: str = "", board: str = "", recording: str = "", limit: int = 50, cursor: str | None = None
     ) -> tuple[list[Row], str | None]:
-        where, values = [], []
+        where, values = [] if recording else [OPEN], []
         if q:
             where.append("(name like ? escape '\\' or board like ? escape '\\' or id = ?)")
             values += [like(q), like(q), q]

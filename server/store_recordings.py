@@ -15,6 +15,10 @@ from calib_core.recording import Recording
 from server.store_db import Connection, Row, dumps, like, now, page
 
 SELECT = "select rowid as at, * from recordings"
+LAB = "lab"
+"""The source of what students of a blind exercise record."""
+OPEN = f"recording not in (select id from recordings where source = '{LAB}')"
+"""What was made of other recordings than theirs."""
 
 
 class Recordings:
@@ -142,7 +146,8 @@ class Recordings:
     def find(
         self, *, q: str = "", board: str = "", limit: int = 50, cursor: str | None = None
     ) -> tuple[list[Row], str | None]:
-        where, values = [], []
+        """Newest first; those of blind exercises are the students' own, who have their ids."""
+        where, values = [f"source != '{LAB}'"], []
         if q:
             where.append("(board like ? escape '\\' or name like ? escape '\\' or id = ?)")
             values += [like(q), like(q), q]

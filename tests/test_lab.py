@@ -154,6 +154,10 @@ def test_runs_join_in_bench_time_and_not_over_a_restart(tmp_path: Path) -> None:
         assert len(both) == 2 * len(one)
         assert gap_s == pytest.approx(lab_bench.BETWEEN_S, abs=0.1)
         assert [run["numbers"] for run in store.lab.runs(student)] == [[1], [1, 2]]
+        store.experiments.add(second, "x", [], {"verdict": "ambiguous"})
+        assert store.recordings.find()[0] == store.recordings.find(board=f"LAB-{code}")[0] == []
+        assert store.experiments.find()[0] == [], "what others' data said would help with one's own"
+        assert len(store.experiments.find(recording=second)[0]) == 1
         lab_bench.run(tmp_path, code, student, WAVE, None, True)
         with pytest.raises(Problem) as refused:
             lab_bench.run(tmp_path, code, student, WAVE, second, False)

@@ -1,4 +1,4 @@
-"""The other pages: language, phone width, lists, comparison, a run's own page."""
+"""The other pages: language, phone width, fonts, lists, comparison, a run's own page."""
 
 import urllib.request
 from collections.abc import Iterator
@@ -48,8 +48,12 @@ def test_language_switch_is_kept_and_sets_the_page_language(window: Window) -> N
 
 
 @pytest.mark.parametrize("locale", ["en-US", "th-TH"])
-def test_no_page_scrolls_sideways_on_a_phone(browser: Any, server: Server, locale: str) -> None:
+def test_no_page_scrolls_sideways_on_a_phone_or_sends_a_face_that_is_not_read(
+    browser: Any, server: Server, locale: str
+) -> None:
     window = Window(browser, server, viewport=PHONE, locale=locale)
+    asked: list[str] = []
+    window.page.on("request", lambda request: asked.append(request.url))
     run = server.call("GET", "/runs")["items"][0]["id"]
     for path in (*PAGES, f"/run.html?id={run}", "/boards.html?id=LPY-A"):
         page = window.open(path)
@@ -59,6 +63,7 @@ def test_no_page_scrolls_sideways_on_a_phone(browser: Any, server: Server, local
         assert stop["height"] >= 48
         assert stop["y"] + stop["height"] <= PHONE["height"], f"{path}: the stop is not on the screen"
     window.close()
+    assert any("sarabun" in url for url in asked) == (locale == "th-TH")
 
 
 def test_axe_finds_nothing_serious_on_any_page(browser: Any, server: Server) -> None:
@@ -207,3 +212,30 @@ def test_limits_decide_and_each_is_shown(window: Window, server: Server) -> None
     assert issued["verdict"] == "fail"
     page = window.open("/certificates.html")
     page.wait_for_selector(f"tr:has-text('{issued['number']}'):has-text('fail')")
+
+
+@pytest.mark.parametrize(
+    ("path", "link"),
+    [
+        ("/boards.html", "tr:has-text('LPY-A') a[href^='/workbench']"),
+        ("/boards.html?id=LPY-A", "a[href^='/workbench'] >> nth=-1"),
+        ("/certificates.html", "tr:has-text('LPY-A') a[href^='/workbench'] >> nth=-1"),
+        ("/run.html", "tr:has-text('LPY-A') a[href^='/workbench'] >> nth=-1"),
+    ],
+)
+def test_every_list_leads_to_the_workbench_with_its_recording(
+    window: Window, server: Server, path: str, link: str
+) -> None:
+    newest = server.call("GET", "/recordings?board=LPY-A")["items"]
+    page = window.open(path)
+    page.click(link)
+    page.wait_for_selector(".opened strong")
+    assert "LPY-A" in window.text(".opened")
+    assert any(row["id"] in page.url for row in newest)
+
+
+def test_the_start_page_says_where_to_look_for_what_is_missing(window: Window) -> None:
+    page = window.open("/")
+    page.click("text=Find what a gyro's model is missing")
+    page.wait_for_selector(".example")
+    assert "missing" in window.text("h1")

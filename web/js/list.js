@@ -1,7 +1,8 @@
 // A searchable list that grows by pages.
 
+import { links } from "./api.js";
 import { $, h, table } from "./dom.js";
-import { t } from "./text.js";
+import { has, t } from "./text.js";
 
 const TYPING_MS = 200;
 
@@ -34,3 +35,11 @@ export async function list(place, { load, head, row, label, empty }) {
 /** The sentence of an empty list and the button that fills it. */
 export const empty = (key, href, button) => () =>
   h("div", { class: "empty stack" }, h("p", {}, t(key)), h("p", {}, h("a", { class: "button main", href }, t(button))));
+
+/** What a recording is called; an example has its title in the reader's language. */
+export const recordingName = (row) =>
+  (row.source === "example" && has(`example.${row.name}.title`) ? t(`example.${row.name}.title`) : row.name || row.board || row.id);
+
+/** A row's way into the workbench; a dash where nothing was recorded. */
+export const toWorkbench = (recording, name) =>
+  (recording ? h("a", { href: links.workbench(recording), "aria-label": t("workbench.open_named", { name }) }, t("workbench.open")) : "–");

@@ -42,6 +42,14 @@ function askToken(problem) {
   }, field, h("button", { type: "submit" }, t("page.use_token"))));
 }
 
+/** Whether the system's own faces have Thai; the page's is not sent for the one word on the button. */
+function hasThai() {
+  const pen = document.createElement("canvas").getContext("2d");
+  pen.font = `32px ${getComputedStyle(document.documentElement).getPropertyValue("--system")}`;
+  // U+0E3E is no letter: what is drawn for it is drawn for whatever is not there.
+  return pen.measureText("ก").width !== pen.measureText("\u0e3e").width;
+}
+
 export function rigSentence(rig) {
   const name = rig.simulated ? t("rig.simulated_at", { speed: speedWord(rig.speed) }) : rig.url;
   const holder = rig.run ? t("rig.in_use") : api.holdsRig() ? t("rig.you_hold") : rig.lease ? t("rig.held_by", { holder: rig.lease.holder }) : t("rig.free");
@@ -79,7 +87,7 @@ export async function page(name, work) {
   nav.setAttribute("aria-label", t("page.pages"));
   nav.append(...PAGES.map(([key, href]) => h("a", { href, "aria-current": key === name ? "page" : null }, t(`page.${key}`))));
   languages.setAttribute("aria-label", t("page.language"));
-  languages.append(...[["en", "EN"], ["th", "ไทย"]].map(([code, word]) => h("button", {
+  languages.append(...[["en", "EN"], ["th", language === "th" || hasThai() ? "ไทย" : "Thai"]].map(([code, word]) => h("button", {
     type: "button", lang: code, "aria-pressed": String(code === language), onclick: () => chooseLanguage(code),
   }, word)));
   translate();

@@ -117,7 +117,7 @@ async function follow(id) {
   }
   const models = setup.models.length ? setup.models : (await api.gyroModels()).items;
   $("#setup").hidden = true;
-  $("#mounting").hidden = true;
+  $("#mounting").hidden = $("#elsewhere").hidden = true;
   $("#about").hidden = false;
   $("#live").hidden = false;
   $("#stop-run").hidden = false;
@@ -196,6 +196,7 @@ async function end(id, hasPictures) {
   $("#documents").replaceChildren(
     ...documents,
     h("a", { class: "button", href: links.run(id) }, t("calibrate.open_run")),
+    run.recording && hasPictures ? h("a", { class: "button", href: links.workbench(run.recording, null) }, t("run.workbench")) : "",
     h("button", { type: "button", id: "again", onclick: again }, t("calibrate.again")),
   );
 }
@@ -205,7 +206,7 @@ function again() {
   leave = () => {};
   watched = null;
   history.replaceState(null, "", "/");
-  for (const [name, hidden] of [["#setup", false], ["#mounting", false], ["#about", true], ["#live", true]]) $(name).hidden = hidden;
+  for (const [name, hidden] of [["#setup", false], ["#mounting", false], ["#elsewhere", false], ["#about", true], ["#live", true]]) $(name).hidden = hidden;
   for (const name of ["#documents", "#results", "#summary"]) $(name).replaceChildren();
   $("#left").textContent = "";
   showIdle();

@@ -2,7 +2,7 @@
 
 import { api, links } from "../api.js";
 import { h, say } from "../dom.js";
-import { empty, list } from "../list.js";
+import { empty, list, toWorkbench } from "../list.js";
 import { page } from "../shell.js";
 import { t, when } from "../text.js";
 
@@ -12,10 +12,10 @@ page("certificates", async (main) => {
   await list(place, {
     load: (q) => api.certificates({ ...q, limit: 50 }),
     label: t("page.certificates"),
-    head: ["number", "board", "verdict", "issued", "operator", "documents", "verify"].map((key) => t(`certificates.${key}`)),
+    head: ["number", "board", "verdict", "issued", "operator", "documents", "workbench", "verify"].map((key) => t(key === "workbench" ? "page.workbench" : `certificates.${key}`)),
     row: (c) => [c.number, h("a", { href: links.board(c.board) }, c.board), t(`verdict.${c.verdict}`), when(c.issued_at), c.operator ?? "",
       h("span", { class: "row" }, ["pdf", "csv", "json"].map((kind) => h("a", { href: links.document(c.number, kind), download: "" }, kind.toUpperCase()))),
-      verifyButton(c.number)],
+      toWorkbench(c.recording, c.number), verifyButton(c.number)],
     empty: empty("certificates.empty", "/", "boards.first"),
   });
 });

@@ -18,14 +18,14 @@ page("run", async (main) => {
 });
 
 async function showRuns(main) {
-  const { empty, list } = await import("../list.js");
+  const { empty, list, toWorkbench } = await import("../list.js");
   const place = h("section", { class: "panel stack" });
   main.append(h("h1", {}, t("run.runs")), place);
   await list(place, {
     load: (q) => api.runs({ ...q, limit: 50 }),
     label: t("run.runs"),
-    head: [t("run.started"), t("setup.board"), t("run.status"), t("setup.profile")],
-    row: (run) => [h("a", { href: links.run(run.id) }, when(run.created_at)), run.board, t(`run.status_${run.status}`), t(`profile.${run.profile}`)],
+    head: [t("run.started"), t("setup.board"), t("run.status"), t("setup.profile"), t("page.workbench")],
+    row: (run) => [h("a", { href: links.run(run.id) }, when(run.created_at)), run.board, t(`run.status_${run.status}`), t(`profile.${run.profile}`), toWorkbench(run.recording, run.board)],
     empty: empty("boards.empty", "/", "boards.first"),
   });
 }

@@ -2,9 +2,10 @@
 
 import { api, links } from "../api.js";
 import { h, say, waiting } from "../dom.js";
+import { recordingName } from "../list.js";
 import { notebook } from "../notebook.js";
 import { page } from "../shell.js";
-import { duration, has, t } from "../text.js";
+import { duration, t } from "../text.js";
 import { showCard } from "../workbench/card.js";
 import { experimentPanel, onRig } from "../workbench/experiment.js";
 import { formulaForm } from "../workbench/formula.js";
@@ -35,7 +36,7 @@ async function open(main, recording, row, signal) {
   const book = notebook();
   const cards = new Map();
   const own = new Map();
-  const name = row.source === "example" && has(`example.${row.name}.title`) ? t(`example.${row.name}.title`) : row.name || row.board || recording;
+  const name = recordingName(row);
   const titles = (effect) => cards.get(effect)?.title ?? effect;
   const error = h("p", { class: "error", role: "alert" });
   const [seen, side, listed, cardPlace, nextPlace, keepPlace, bookPlace] = ["pictures stack", "side stack", "list stack", "panel stack about", "panel stack", "panel stack", "panel stack"]

@@ -2,7 +2,7 @@
 
 import { api, links } from "../api.js";
 import { h, say } from "../dom.js";
-import { list } from "../list.js";
+import { list, recordingName } from "../list.js";
 import { duration, t, when } from "../text.js";
 
 /** Shows what there is to open; choosing goes to the recording's own address. */
@@ -49,7 +49,7 @@ export async function choose(main, carried) {
     load: (q) => api.recordings({ ...q, limit: 10 }),
     label: t("workbench.recordings"),
     head: [t("workbench.recording"), t("workbench.made"), { n: t("run.length") }],
-    row: (row) => [h("a", { href: links.workbench(row.id, null, carried) }, row.source === "example" ? t(`example.${row.name}.title`) : row.name || row.board || row.id), when(row.created_at),
+    row: (row) => [h("a", { href: links.workbench(row.id, null, carried) }, recordingName(row)), when(row.created_at),
       { n: row.duration_s ? duration(row.duration_s) : t("workbench.points", { count: row.samples }) }],
     empty: () => h("p", { class: "empty muted" }, t("workbench.no_recordings")),
   });
