@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects.base import Acts
+from calib_core.gap_floor import coded
 from calib_core.gap_gram import Gram
 from calib_core.gap_space import Space, Term
 from calib_core.integral_fit import SUFFIX
 from calib_core.weak_form import Windows
+from calib_core.whitening import RowNoise
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BINS = 14
+MISFIT, LACKING_S = 0.1, 2.0
+"""A residual whose square exceeds the noise's by this share lacks something, which lasts about so long."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +62,12 @@ class Explanation:
         scale = space.scale_factor or 1.0
         self.windows = windows = Windows(len(samples.time_s), samples.interval_s)
         self.first = self._whole(windows)
-        rate_shapes, angle_shapes = self._shapes()
+        rates, angles = self._shapes()
         output = (samples.output - space.values[0]) / scale
         truth = windows.rate(_angle(space)) if design.readings is not None else windows.mean(c.rate_dps[:, None])
-        base = [np.ones(len(output)) / scale]
-        if design.moves:
-            base.append(c.rate_dps / scale)
-        base += [np.zeros(len(output))] * (space.base.shape[1] - len(base))
-        self.columns = np.column_stack(
-            [windows.mean(np.column_stack(base)), windows.mean(rate_shapes) + windows.rate(angle_shapes)]
-        )[self.first]
+        columns = windows.mean(rates)
+        columns[:, space.base.shape[1] :] += windows.rate(angles)
+        self.columns = columns[self.first]
         self.measured = (windows.mean(output[:, None]) - truth)[self.first, 0]
         self.middle_s: F64 = samples.time_s[windows.first[self.first] + windows.width // 2] - samples.time_s[0]
         self.gram = space.gram(terms, folds=True)
@@ -80,18 +81,23 @@ class Explanation:
         return np.flatnonzero(broken[first] == broken[first + windows.width - 1])
 
     def _shapes(self) -> tuple[F64, F64]:
-        """What the terms' columns are at the samples: in deg/s, and in deg where they act on the encoder."""
-        k = len(self.space.covariates.time_s)
+        """What base and terms are at the samples: (k, b + p) in deg/s, and (k, p) in deg where terms act on the
+        encoder, turned round. Columns of the base that stand for what is not seen in a window are nothing here."""
+        space = self.space
+        k, b, scale = len(space.covariates.time_s), space.base.shape[1], space.scale_factor or 1.0
         width = sum(t.columns.shape[1] for t in self.terms)
-        rates, angles, at = np.zeros((k, width)), np.zeros((k, width)), 0
+        rates, angles, at = np.zeros((k, b + width)), np.zeros((k, width)), b
+        rates[:, 0] = 1.0 / scale
+        if space.design.moves:
+            rates[:, 1] = space.covariates.rate_dps / scale
         for term in self.terms:
-            part = slice(at, at + term.columns.shape[1])
-            acts, shapes = self.space.shapes(term)
+            end = at + term.columns.shape[1]
+            acts, shapes = space.shapes(term)
             if acts is Acts.ANGLE:
-                angles[:, part] = -shapes
+                angles[:, at - b : end - b] = -shapes
             else:
-                rates[:, part] = shapes / (1.0 if acts is Acts.RATE else (self.space.scale_factor or 1.0))
-            at = part.stop
+                rates[:, at:end] = shapes / (1.0 if acts is Acts.RATE else scale)
+            at = end
         return rates, angles
 
     @property
@@ -155,26 +161,32 @@ class Explanation:
         values[:, self._estimated] += self._open.left_out(self._free)[1]
         unseen = values[folds.of_time(self.middle_s + self.space.design.averages.samples.time_s[0])]
         left = self.measured - np.einsum("ij,ij->i", self.columns, unseen)
-        floor = float(np.sqrt(np.mean(self.spread() ** 2)))
+        floor = float(np.sqrt(np.mean(self.spread**2)))
         return Error(float(np.sqrt(np.mean(left**2))), floor, folds.block_s, len(folds.edges) - 1)
 
+    @cached_property
     def spread(self) -> F64:
-        """(w,) what the noise gives each window."""
-        space, design = self.space, self.space.design
-        noise, scale = space.noise.noise, space.scale_factor or 1.0
-        variance = np.zeros(len(space.covariates.time_s))
-        if design.readings is not None:
-            variance += np.interp(design.averages.samples.time_s, design.readings.time_s, design.readings.variance)
-            variance[design.averages.at[design.averages.at >= 0]] = 0.0
-        spread = self.windows.spread(noise.white / scale, noise.ar1 / scale, noise.correlation_time_s, variance)
-        if design.readings is not None:
-            # The encoder's error at rest is one draw: a window that the rest fills in part sees it whole.
-            still = design.averages.at[design.averages.at >= 0]
-            fresh = np.flatnonzero(np.diff(still, prepend=-2) != 1)
-            last = np.append(fresh[1:], len(still)) - 1
-            seen = self.windows.resting(still[fresh], still[last] + 1) if len(still) else 0.0
-            spread = np.sqrt(spread**2 + design.readings.step_deg**2 / 12.0 * seen)
-        return np.asarray(spread[self.first])
+        """(w,) what the gyro's noise and the encoder's codes give each window, one standard deviation."""
+        noise, scale = self.space.noise.noise, abs(self.space.scale_factor) or 1.0
+        noise = replace(noise, white=noise.white / scale, ar1=noise.ar1 / scale)
+        gyro = self.windows.spread(noise.white, noise.ar1, noise.correlation_time_s)
+        if self.space.design.readings is None or not self.space.design.moves:
+            return np.full(len(self.first), gyro)
+        rates, angles = self._shapes()
+        output, sizes = self.space.design.averages.samples.output, self.solution[0]
+        rate = (output - self.space.values[0]) / self.space.scale_factor - rates @ sizes
+        shown = -angles @ sizes[self.gram.base :]
+
+        def squares(noise: RowNoise) -> F64:
+            return gyro**2 + coded(self.space.design, self.windows, rate, shown, noise)[self.first]
+
+        first = squares(noise)
+        misfit = float(np.mean(self.residual(sizes) ** 2 - first))
+        if misfit < MISFIT * float(first.mean()):
+            return np.sqrt(first)
+        # What the model lacks is none of the noise, but it must not bend the path either.
+        lacking = replace(noise, ar1=math.hypot(noise.ar1, math.sqrt(misfit)), correlation_time_s=LACKING_S)
+        return np.sqrt(squares(lacking))
 
     def along(self) -> dict[str, F64]:
         """What residuals are looked at against, by name: (w,) means over the windows."""
@@ -182,7 +194,7 @@ class Explanation:
 
     def failures(self) -> list[Failure]:
         """The worst stretch of each covariate, worst first: bins of equal count against the mean of their noise."""
-        residual, spread = self.residual(self.solution[0]), self.spread()
+        residual, spread = self.residual(self.solution[0]), self.spread
         found = []
         for name, at in self.along().items():
             order = np.argsort(at, kind="stable")

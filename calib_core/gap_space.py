@@ -118,7 +118,7 @@ class Space:
         if design.readings is not None and design.moves and samples.average_s == 0.0:
             # Between point samples the output is a guess, wrong by about h²/8·ω'' where motion begins and ends: as much
             # as tells a lag from a delay of 3 ms. A column of that shape, with that size as its standard deviation.
-            bend = np.gradient(self._felt(), samples.interval_s)[:, None]
+            bend = np.gradient(self.felt, samples.interval_s)[:, None]
             self.base = np.column_stack([self.base, self.over_rows(Acts.ANGLE, bend)])
             self.prior = np.append(self.prior, 8.0 / samples.interval_s**2)
         self._listed: tuple[Term, ...] = ()
@@ -240,7 +240,8 @@ class Space:
         mean, change = integrals(self.design.averages)
         return self._condensing @ mean, self._condensing @ change
 
-    def _felt(self) -> F64:
+    @property
+    def felt(self) -> F64:
         """(k,) the measured rate, zero at rest; the reference's own where it is a rate."""
         if self.design.readings is None:
             return self.covariates.rate_dps
@@ -253,7 +254,7 @@ class Space:
         """A late answer in terms of the measured rate w: the angle lags by w + κτ·w'; τ is the setting."""
         assert effect.curvature is not None
         tau = setting[0] if setting else 0.0
-        shape = self._felt()
+        shape = self.felt
         if tau:
             shape = shape + effect.curvature * tau * np.gradient(shape, self.covariates.interval_s)
         sign = -1.0 if effect.name == "angular_acceleration" else 1.0

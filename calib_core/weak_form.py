@@ -58,27 +58,14 @@ class Windows:
         view = np.lib.stride_tricks.sliding_window_view(values, self.width, axis=0)[self.first]
         return np.asarray(view @ weights * self.interval_s)
 
-    def resting(self, begin: Ints, end: Ints) -> F64:
-        """(w,) squares, summed over the rests from sample ``begin`` to before ``end`` (r,), of what an error of the
-        angle that is one throughout a rest does to each window: nothing where the window lies within."""
-        total = np.concatenate([[0.0], np.cumsum(self.slope * self.interval_s)])
-        out = np.zeros(len(self.first))
-        for a, b in zip(begin.tolist(), end.tolist(), strict=True):
-            few = slice(*np.searchsorted(self.first, [a - self.width + 1, b]))
-            first = self.first[few]
-            inside = np.clip([a - first, b - first], 0, self.width)
-            out[few] += (total[inside[1]] - total[inside[0]]) ** 2
-        return out
+    @property
+    def steepness(self) -> float:
+        """The square that independent errors of the angle, each of 1 deg, bring into a window."""
+        return float(np.sum((self.slope * self.interval_s) ** 2))
 
-    def spread(self, white: float, ar1: float, correlation_time_s: float, angle_variance: F64) -> F64:
-        """(w,) the standard deviation that noise gives each window.
-
-        ``white`` and ``ar1`` are deviations of one sample in deg/s, ``angle_variance`` (k,) the variance of each
-        sample's angle in deg² (0 at rest, where the encoder's error is a constant that the window does not see).
-        """
+    def spread(self, white: float, ar1: float, correlation_time_s: float) -> float:
+        """The standard deviation that a gyro's noise gives a window: ``white`` and ``ar1`` of one sample, deg/s."""
         lag = np.arange(self.width)
         bump = self.bump * self.interval_s
         covariance = ar1**2 * np.exp(-np.abs(lag[:, None] - lag) * self.interval_s / correlation_time_s)
-        gyro = white**2 * float(bump @ bump) + float(bump @ covariance @ bump)
-        squares = np.lib.stride_tricks.sliding_window_view(angle_variance, self.width)[self.first]
-        return np.sqrt(gyro + squares @ (self.slope * self.interval_s) ** 2)
+        return float(np.sqrt(white**2 * float(bump @ bump) + float(bump @ covariance @ bump)))

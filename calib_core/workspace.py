@@ -62,7 +62,7 @@ class Fitted:
     @cached_property
     def spread_dps(self) -> F64:
         """(w,) the standard deviation that noise gives each window."""
-        return self.explanation.spread()
+        return self.explanation.spread
 
     @cached_property
     def along(self) -> Mapping[str, F64]:

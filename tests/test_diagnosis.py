@@ -162,7 +162,8 @@ def test_a_model_that_is_given_is_the_one_that_is_judged(file: Path, capsys: pyt
     assert told["model"]["effects"] == ["bandwidth_lag"]
     assert any(parameter["name"] == "bandwidth_lag.tau" for parameter in told["model"]["parameters"])
     assert told["verdict"] == "adequate"
-    assert told["error"]["held_out_rms_dps"] < 1.1 * told["error"]["floor_rms_dps"]
+    # 70 windows that overlap by half: their RMS is known to a tenth.
+    assert told["error"]["held_out_rms_dps"] == pytest.approx(told["error"]["floor_rms_dps"], rel=0.25)
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,17 @@ def test_adding_what_is_missing_lowers_the_error_to_the_floor(workspace: Workspa
     assert max(workspace.gains(both).values()) < 15.0 < 1000.0 < max(workspace.gains(base).values())
 
 
+def test_the_floor_is_what_the_right_model_leaves_whatever_model_is_tried(workspace: Workspace) -> None:
+    """A rest's error is one draw and a slow code's a sawtooth: taken for white noise they were off by a quarter."""
+    tried = [workspace.fit(names).error for names in ((), ("bias_temperature", "scale_factor_asymmetry"))]
+    assert tried[0].floor_rms_dps == pytest.approx(tried[1].floor_rms_dps, rel=0.1)
+    healthy = Workspace.of(as_recording(record(3, {}, plan="first")), "x").fit().error
+    # Some hundred windows: the RMS of one record scatters by a twentieth.
+    ratios = [error.held_out_rms_dps / error.floor_rms_dps for error in (tried[1], healthy)]
+    assert max(ratios) < 1.12
+    assert min(ratios) > 0.9
+
+
 def test_a_model_tried_by_hand_is_the_one_that_the_diagnosis_makes(workspace: Workspace, made: Record) -> None:
     answer = to_json(diagnose(as_recording(made), "x", effects=["scale_factor_asymmetry"]))
     tried = workspace.fit(["scale_factor_asymmetry"])
