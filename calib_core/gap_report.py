@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_core.effects import Acts
 from calib_core.gap import Diagnosis, on_grid, p_value
 from calib_core.gap_error import Explanation
 from calib_core.gap_search import equivalent_z
@@ -139,11 +140,15 @@ def parameters(explanation: Explanation) -> list[dict[str, Any]]:
         per = "1" if unit == "deg/s" else f"{unit}/(deg/s)"
         rows.append(_parameter(name, float(space.values[1] + values[1]), per, spread[1]))
     at = space.base.shape[1]
+    # Columns that act on a rate or an angle were made with the scale factor as it was before these terms were there.
+    scaled = space.scale_factor / (space.scale_factor + float(values[1])) if len(space.values) > 1 else 1.0
     for term in explanation.terms:
         own = term.effect.parameters()
+        as_made = term.effect.acts is Acts.OUTPUT or term.effect.curvature is not None
         for k, name in enumerate(term.names):
             if name:
-                size = (float(values[at + k]), spread[at + k])
+                u, share = spread[at + k], 1.0 if as_made or known[at + k] else scaled
+                size = float(values[at + k]) * share, None if u is None else u * share
                 rows.append(_parameter(f"{term.name}.{name}", size[0], _unit(own[name].unit, unit), size[1]))
         for name, value in zip(term.effect.nonlinear(), term.setting, strict=False):
             rows.append(_parameter(f"{term.name}.{name}", value, _unit(own[name].unit, unit), None))

@@ -76,6 +76,14 @@ def test_the_floor_is_what_the_right_model_leaves_whatever_model_is_tried(worksp
     assert min(ratios) > 0.9
 
 
+def test_a_size_that_multiplies_the_rate_is_told_per_scale_factor_as_it_is() -> None:
+    """Fitted beside a scale factor that had to make up for it, a cubic was told two per cent too large."""
+    cubic = Workspace.of(as_recording(record(2, {"scale_factor_cubic": 2.0}, plan="second")), "x")
+    told = {p["name"]: p for p in cubic.fit(["scale_factor_cubic"]).parameters}["scale_factor_cubic.k"]
+    assert abs(told["value"]) == pytest.approx(2.4e-6, abs=2.0 * told["standard_uncertainty"], rel=0.0)
+    assert told["standard_uncertainty"] < 0.012 * 2.4e-6
+
+
 def test_a_model_tried_by_hand_is_the_one_that_the_diagnosis_makes(workspace: Workspace, made: Record) -> None:
     answer = to_json(diagnose(as_recording(made), "x", effects=["scale_factor_asymmetry"]))
     tried = workspace.fit(["scale_factor_asymmetry"])
