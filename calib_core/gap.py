@@ -6,7 +6,7 @@ not seen. Everything is told by codes and values; sentences are made where a lan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,10 +67,12 @@ def diagnose(
     effects: Sequence[str] = (),
     suspects: dict[str, type[Effect]] | None = None,
     seed: int = 0,
+    told: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
     """Compares ``axis`` of the recording with base + ``effects`` and names what is missing.
 
-    ``suspects`` replaces the library (a user's own effects, or one left out on purpose). Raises Problem for a recording
+    ``suspects`` replaces the library (a user's own effects, or one left out on purpose); ``told`` hears what begins:
+    "fitting", "searching", "structure". Raises Problem for a recording
     without the axis or without a reference.
     """
     answer = Diagnosis(recording, axis, checks(recording, axis))
@@ -78,9 +80,11 @@ def diagnose(
         return answer
     pool = dict(library() if suspects is None else suspects)
     rng = np.random.default_rng(seed)
+    told("fitting")
     space, search = _search(recording, axis, pool, effects, rng)
     if "saturation" in pool:
         space, search = _clipped(answer, recording, space, search, pool, effects, rng)
+    told("searching")
     _sought(search)
     coarse = next((c for c in answer.checks if c.code == "check.record.adc_coarse"), None)
     if "adc_quantization" in pool and coarse is not None:
@@ -91,6 +95,7 @@ def diagnose(
             # Beside a bias that wanders a step or a drift must be plainer, and the rest may be plainer to see.
             search = Search(search.space, search.suspects, rng, search.chosen[: search.given], columns=search.columns)
             _sought(search)
+    told("structure")
     if answer.coarse is not None:
         _beyond(search, answer.coarse)
     else:

@@ -90,11 +90,6 @@ class Workbench:
     _own: dict[str, type[Effect]] = field(default_factory=dict)
 
     @cached_property
-    def diagnosis(self) -> gap.Diagnosis:
-        """Of the base alone."""
-        return gap.diagnose(self.recording, self.axis)
-
-    @cached_property
     def _parts(self) -> tuple[Workspace, Workspace | None, gap_saturation.Clip | None]:
         """All samples; those that are on no limit, and the limits, where these explain more than any other effect."""
         space = gap.prepare(self.recording, self.axis)

@@ -23,30 +23,45 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-class Compute:
-    """One process, started with the first work and again if it was ended."""
+STAGES = ("reading", "fitting", "searching", "structure", "motions")
+"""What a long work is at; a page has a sentence for each."""
+SLOTS = 256
+"""So many works can tell theirs at a time."""
 
-    def __init__(self) -> None:
+
+class Compute:
+    """A process or a few, started with the first work and again if one was ended."""
+
+    def __init__(self, processes: int = 1, *, niceness: int = 0) -> None:
+        self._processes, self._niceness = processes, niceness
         self._pool: ProcessPoolExecutor | None = None
+        self._stages: Any = None
         self._once: dict[str, Any] = {}
 
-    async def run(self, work: Callable[..., T], *arguments: object) -> T:
+    async def run(self, work: Callable[..., T], *arguments: object, slot: int = 0) -> T:
         from concurrent.futures import ProcessPoolExecutor
         from concurrent.futures.process import BrokenProcessPool
 
         for attempt in (1, 2):
             if self._pool is None:
                 context = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=_begin)
+                self._stages = context.RawArray("b", SLOTS)
+                told = (self._niceness, self._stages)
+                self._pool = ProcessPoolExecutor(self._processes, mp_context=context, initializer=_begin, initargs=told)
             pool = self._pool
+            self._stages[slot] = 0
             try:
-                return await asyncio.get_running_loop().run_in_executor(pool, work, *arguments)
+                return await asyncio.get_running_loop().run_in_executor(pool, _watched, slot, work, *arguments)
             except BrokenProcessPool:
                 if self._pool is pool:
                     self._pool = None
                 if attempt == 2:
                     raise Problem("server.fault", kind="BrokenProcessPool") from None
         raise AssertionError("unreachable")
+
+    def stage(self, slot: int) -> str:
+        """What the work that was given this slot is at."""
+        return STAGES[0 if self._stages is None else self._stages[slot]]
 
     async def once(self, name: str, work: Callable[[], T]) -> T:
         """What does not change while the program runs, computed at the first request for it."""
@@ -61,7 +76,27 @@ class Compute:
             self._pool = None
 
 
-def _begin() -> None:
+_told: Any = None
+_slot = 0
+
+
+def _watched(slot: int, work: Callable[..., T], *arguments: object) -> T:
+    global _slot
+    _slot = slot
+    return work(*arguments)
+
+
+def tell(stage: str) -> None:
+    """Says what the work in this process is at, to whoever waits for it."""
+    if _told is not None:
+        _told[_slot] = STAGES.index(stage)
+
+
+def _begin(niceness: int, stages: Any) -> None:
+    global _told
+    _told = stages
+    if niceness and hasattr(os, "nice"):  # not on Windows
+        os.nice(niceness)
     # The small matrices of this work are slower with two threads than with one.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is the server's; it ends this process in order
@@ -170,7 +205,7 @@ def diagnose(
         if readings is not None:
             return diagnosis.of_points(readings, **asked, board=board)[0]
         rig = {name: Axis(**facts) for name, facts in axes.items()}
-        return diagnosis.of_recording(store.recording(recording), **asked, axes=rig or None)
+        return diagnosis.of_recording(store.recording(recording), **asked, axes=rig or None, told=tell)
 
 
 def example(data: Path, name: str) -> str:

@@ -5,7 +5,7 @@ numbers, codes and values, the same in every language; the second adds their sen
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,10 +96,11 @@ def of_recording(
     file: str | None = None,
     suspects: "Mapping[str, type[Effect]] | None" = None,
     axes: "Mapping[str, Axis] | None" = None,
+    told: Callable[[str], None] = lambda _: None,
 ) -> Words:
     """CONTRACT 3 for one axis: the one asked for, else the one that the header names, else the first.
 
-    ``next_experiment`` is what a rig with ``axes`` could do (None: the usual bench).
+    ``next_experiment`` is what a rig with ``axes`` could do (None: the usual bench). ``told`` hears of each stage.
     """
     from calib_core.effects import library
     from calib_core.gap import diagnose
@@ -109,7 +110,8 @@ def of_recording(
     pool = dict(library() if suspects is None else suspects)
     _known(effects, pool)
     axis = axis_of(recording, axis)
-    found = diagnose(recording, axis, effects=effects, suspects=pool)
+    found = diagnose(recording, axis, effects=effects, suspects=pool, told=told)
+    told("motions")
     answer = to_json(found)
     answer["recording"]["file"] = file
     answer["user_effects"] = own_effects(pool, [*effects, *(m["effect"] for m in answer["missing"])])

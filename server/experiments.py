@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
 from server import diagnosis
+from server.compute import tell
 
 if TYPE_CHECKING:
     from calib_core.effects import Effect
@@ -128,7 +129,8 @@ def proposed(
         if axis not in hand.axes:
             raise Problem("diagnosis.no_axis", axis=axis, axes=", ".join(hand.axes))
         known = {name: Axis(**facts) for name, facts in axes.items()}
-        answer = diagnosis.of_recording(hand, axis=axis, effects=effects, suspects=store.effects.suspects(), axes=known)
+        suspects = store.effects.suspects()
+        answer = diagnosis.of_recording(hand, axis=axis, effects=effects, suspects=suspects, axes=known, told=tell)
         following = answer["next_experiment"]
         if following is None:
             raise Problem("experiment.nothing_open", axis=axis)
@@ -183,8 +185,8 @@ def judged(data: Path, experiment: str) -> None:
         done = store.recording(store.runs.get(row["run"])["recording"])
         try:
             both = join(hand, done, row["axis"], _between(hand.header, done.header))
-            suspects = store.effects.suspects()
-            answer = diagnosis.of_recording(both, axis=row["axis"], effects=row["effects"], suspects=suspects)
+            asked = {"axis": row["axis"], "effects": row["effects"], "suspects": store.effects.suspects()}
+            answer = diagnosis.of_recording(both, **asked, told=tell)
             board = done.header.get("board", "")
             kept = store.recordings.add(both, board=board, name=f"{board}+{experiment}", source="experiment")
             result: Words = {"recording": kept, "diagnosis": answer}

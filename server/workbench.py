@@ -14,6 +14,7 @@ import numpy as np
 
 from calib_core.problem import Problem
 from server import diagnosis, workbench_points
+from server.compute import tell
 from server.live import encode
 from server.texts import render, texts
 
@@ -117,7 +118,7 @@ def fit(
     noise = fitted.explanation.space.noise.noise
     head = {
         "axis": axis, "unit": samples.unit, "effects": list(model.effects), "samples": len(time),
-        "whole": len(at) == inside.stop - inside.start, "error": _error(model),
+        "whole": len(at) == inside.stop - inside.start, "error": _error(model), "possible": bench.effects,
         "steps": [_error(bench.fit(model.effects[:k]))["held_out"] for k in range(len(model.effects) + 1)],
         "parameters": model.parameters, "failures": _failures(model, lang),
         "along": [diagnosis.placed(n) for n in along],
@@ -126,21 +127,45 @@ def fit(
     return encode(diagnosis.plain(head), arrays)
 
 
-def suspects(data: Path, recording: str, axis: str, effects: Sequence[str], board: str, lang: str) -> Words:
-    """The verdict on the base, and every effect of the library with its evidence beside ``effects``."""
+def searched(data: Path, recording: str, axis: str) -> Words:
+    """What a search of the library says of the base: the diagnosis, the |z| that noise alone reaches, and the effects
+    that a model of this recording can have."""
+    from calib_core.gap import diagnose
     from calib_core.gap_report import to_json
+    from calib_core.workbench import BY_THEMSELVES
+    from server.store import Store
 
+    with Store(data) as store:
+        loaded = store.recording(recording)
+    found = diagnose(loaded, diagnosis.axis_of(loaded, axis), told=tell)
+    possible = (*found.search.suspects, *BY_THEMSELVES) if found.search else ()
+    threshold = found.search.threshold if found.search else float("inf")
+    return {"diagnosis": diagnosis.explained(to_json(found)), "threshold": threshold, "possible": possible}
+
+
+def suspects(
+    data: Path,
+    recording: str,
+    axis: str,
+    effects: Sequence[str],
+    board: str,
+    lang: str,
+    found: Words | None = None,
+) -> Words:
+    """The verdict on the base, and every effect of the library with its evidence beside ``effects``.
+
+    ``found``: what ``searched`` gave, where it was asked before.
+    """
     readings = _readings(data, recording)
     if readings is not None:
-        found, threshold, possible = workbench_points.suspects(readings, axis, board, effects, lang)
-        rows = {row["effect"]: {**row, "z": _z(row)} for row in found["candidates"]}
-        return _listed(found, rows, found["rivals"], threshold, effects, possible, lang)
-    bench = warm(data, recording, axis)
-    answer = diagnosis.told(diagnosis.explained(to_json(bench.diagnosis)), lang)
-    threshold = bench.diagnosis.search.threshold if bench.diagnosis.search else float("inf")
+        answer, threshold, possible = workbench_points.suspects(readings, axis, board, effects, lang)
+        rows = {row["effect"]: {**row, "z": _z(row)} for row in answer["candidates"]}
+        return _listed(answer, rows, answer["rivals"], threshold, effects, possible, lang)
+    found = found or searched(data, recording, axis)
+    answer, threshold = diagnosis.told(found["diagnosis"], lang), found["threshold"]
     rows = {row["effect"]: {**row, "z": _z(row)} for row in answer["candidates"]}
-    ties = _beside(bench, effects, rows, threshold) if effects else _found(answer, rows)
-    return _listed(answer, rows, ties, threshold, effects, bench.effects, lang)
+    ties = _beside(warm(data, recording, axis), effects, rows, threshold) if effects else _found(answer, rows)
+    return _listed(answer, rows, ties, threshold, effects, found["possible"], lang)
 
 
 def _listed(

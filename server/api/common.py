@@ -10,6 +10,7 @@ from server import texts
 from server.batch import BatchProcess
 from server.compute import Compute
 from server.lease import Lease
+from server.searches import Searches
 from server.settings import Settings
 from server.store import Store
 from server.store_db import CURSOR_PATTERN
@@ -25,6 +26,7 @@ class Services:
         self.store = Store(settings.data)
         self.lease = Lease()
         self.compute = Compute()
+        self.searches = Searches()
         self.bench = Compute()  # students' runs, a moment each, do not wait for a long diagnosis
         self.supervisor = Supervisor(settings, self.store)
         self.batches = BatchProcess(self.store)
@@ -39,6 +41,7 @@ class Services:
         self.supervisor.close()
         self.batches.close()
         self.compute.close()
+        self.searches.close()
         self.bench.close()
         self.store.close()
 

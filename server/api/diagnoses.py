@@ -1,5 +1,6 @@
 """What a recording's model is missing."""
 
+import json
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
@@ -68,5 +69,8 @@ class Diagnosis(Answer):
 )
 async def diagnose(recording: str, body: DiagnosisBody, here: Here, lang: Language) -> Diagnosis:
     effects, axes = tuple(dict.fromkeys(body.effects)), (here.supervisor.rig or {}).get("axes", {})
-    answer = await here.compute.run(compute.diagnose, here.store.data, recording, body.axis, effects, body.board, axes)
+    samples = here.store.recordings.row(recording)["samples"]
+    asked = (recording, body.axis, "diagnosis", effects, body.board, json.dumps(axes))
+    given = (here.store.data, recording, body.axis, effects, body.board, axes)
+    answer = await here.searches.run((*asked, samples), samples, compute.diagnose, *given)
     return Diagnosis.model_validate(diagnosis.told(answer, lang))

@@ -1,5 +1,6 @@
 """Experiments: the motion that would settle what a recording leaves open, done on the rig and judged with it."""
 
+import secrets
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
@@ -93,9 +94,10 @@ def shown(here: Services, row: dict[str, Any], lang: str) -> Experiment:
 async def propose(body: ExperimentBody, here: Here, lang: Language) -> Experiment:
     axes = (here.supervisor.rig or {}).get("axes", {})
     effects = tuple(dict.fromkeys(body.effects))
-    made = await here.compute.run(
-        experiments.proposed, here.store.data, body.recording, body.axis, effects, axes, here.supervisor.url
-    )
+    samples = here.store.recordings.row(body.recording)["samples"]
+    given = (body.recording, body.axis, effects, axes, here.supervisor.url)
+    asked = (body.recording, body.axis, "motion", secrets.token_hex(4))  # each gets a proposal of its own
+    made = await here.searches.run(asked, samples, experiments.proposed, here.store.data, *given)
     return shown(here, here.store.experiments.get(made), lang)
 
 
@@ -134,6 +136,8 @@ def run(experiment: str, body: ExperimentRunBody, here: Here, lang: Language, le
 async def one(experiment: str, here: Here, lang: Language) -> Experiment:
     row = here.store.experiments.get(experiment)
     if row["run"] and row["result"] is None and here.store.runs.get(row["run"])["status"] == "finished":
-        await here.compute.run(experiments.judged, here.store.data, experiment)
+        samples = here.store.recordings.row(row["recording"])["samples"]
+        asked = (row["recording"], row["axis"], "judged", experiment)
+        await here.searches.run(asked, samples, experiments.judged, here.store.data, experiment)
         row = here.store.experiments.get(experiment)
     return shown(here, row, lang)

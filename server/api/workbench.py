@@ -6,6 +6,7 @@ from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from pydantic import Field
 
+from calib_core.points import FORMAT
 from server import compute, examples, workbench
 from server.api.common import Here, Language
 from server.api.models import Answer, Body, Plain
@@ -61,6 +62,13 @@ class Suspects(Answer):
     sentence: str
     threshold: float | None = Field(description="the z that noise alone reaches in one recording of a hundred")
     suspects: list[Suspect]
+
+
+class Progress(Plain):
+    """``stage``: null where nothing is searched, "queued", or what is being done."""
+
+    stage: Literal["queued", "reading", "fitting", "searching", "structure", "motions"] | None
+    seconds: float
 
 
 class Path(Plain):
@@ -138,10 +146,20 @@ async def suspects(
     effects: Annotated[str, Query(max_length=1000, description="names, with commas between them")] = "",
     board: Board = "",
 ) -> Suspects:
-    here.store.recordings.row(recording)
-    names = tuple(filter(None, effects.split(",")))
-    answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, board, lang)
+    row = here.store.recordings.row(recording)
+    names, found = tuple(filter(None, effects.split(","))), None
+    if row["header"].get("format") != FORMAT:
+        asked = (recording, axis, "suspects", row["samples"])
+        given = (here.store.data, recording, axis)
+        found = await here.searches.run(asked, row["samples"], workbench.searched, *given, keep=True)
+    answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, board, lang, found)
     return Suspects.model_validate(answer)
+
+
+@router.get("/recordings/{recording}/progress", summary="How far a search is that goes on for a recording")
+def progress(recording: str, axis: AxisName, here: Here) -> Progress:
+    stage, seconds = here.searches.progress(recording, axis)
+    return Progress.model_validate({"stage": stage, "seconds": seconds})
 
 
 @router.get("/experiments/{experiment}/motion", summary="An experiment's motion, to be drawn", responses=declared(404))

@@ -165,6 +165,7 @@ export const api = {
   signal: (recording, q) => call("GET", `/recordings/${id(recording)}/signal${query(q)}`),
   fit: (recording, body) => call("POST", `/recordings/${id(recording)}/fit`, body),
   suspects: (recording, { effects, ...q }) => call("GET", `/recordings/${id(recording)}/suspects${query({ ...q, effects: effects.join(",") })}`),
+  progress: (recording, axis) => call("GET", `/recordings/${id(recording)}/progress${query({ axis })}`),
   keepEffect: (own) => call("POST", "/effects", own),
   saveModel: (body) => call("POST", "/models", body),
   experimentMotion: (experiment) => call("GET", `/experiments/${id(experiment)}/motion`),

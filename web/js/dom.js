@@ -38,14 +38,18 @@ export function say(place, problem) {
   place.textContent = problem ? problem.message : "";
 }
 
-/** A paragraph that says since when it waits, until it is taken out: long work must not look dead. */
-export function waiting(text) {
+/** A paragraph that says since when it waits, until it is taken out: long work must not look dead.
+ * ask() may give what is being done now, in words. */
+export function waiting(text, ask = null) {
+  const what = h("span", { role: "status" }, text);
   const seconds = h("span", { "aria-hidden": "true" });
-  const node = h("p", { class: "muted" }, text, seconds);
+  const node = h("p", { class: "muted" }, what, seconds);
   const began = performance.now();
-  const timer = setInterval(() => {
-    if (!node.isConnected) clearInterval(timer);
-    else seconds.textContent = ` ${Math.round((performance.now() - began) / 1000)} s`;
+  const timer = setInterval(async () => {
+    if (!node.isConnected) { clearInterval(timer); return; }
+    seconds.textContent = ` ${Math.round((performance.now() - began) / 1000)} s`;
+    const now = await ask?.().catch(() => null);
+    if (now && what.textContent !== now) what.textContent = now;
   }, 1000);
   return node;
 }

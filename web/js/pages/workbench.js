@@ -14,7 +14,7 @@ import { keepPanel } from "../workbench/keep.js";
 import { ledger } from "../workbench/ledger.js";
 import { pictures } from "../workbench/pictures.js";
 import { choose } from "../workbench/start.js";
-import { showSuspects } from "../workbench/suspects.js";
+import { showByHand, showSuspects } from "../workbench/suspects.js";
 
 const GUESS_FIRST = "gyrobench.guess-first";
 const asked = new URLSearchParams(location.search);
@@ -42,7 +42,13 @@ async function open(main, recording, row, signal) {
   const [seen, side, listed, cardPlace, nextPlace, keepPlace, bookPlace] = ["pictures stack", "side stack", "list stack", "panel stack about", "panel stack", "panel stack", "panel stack"]
     .map((name) => h("section", { class: name }));
   const isGuessing = h("input", { type: "checkbox", id: "guess-first", checked: localStorage.getItem(GUESS_FIRST) === "yes", onchange: () => { localStorage.setItem(GUESS_FIRST, isGuessing.checked ? "yes" : "no"); guess = null; refresh(); } });
-  const suspectsPlace = h("div", {}, waiting(t("workbench.looking")));
+  const progress = async () => {
+    const { stage } = await api.progress(recording, axis);
+    return stage && t(`workbench.stage.${stage}`);
+  };
+  const suspectsPlace = h("div", { class: "stack" }, waiting(t("workbench.looking"), progress));
+  const byHand = h("div", {});
+  suspectsPlace.append(byHand);
   const verdict = h("p", { class: "verdict" });
   listed.classList.add("panel");
   listed.append(
@@ -66,6 +72,7 @@ async function open(main, recording, row, signal) {
   let guess = null;
   let form = null;
   let busy = false;
+  let judged = 0;
   const draw = pictures(seen, { unit, points: signal.points, detail: ([begin_s, end_s]) => fit(history[at].effects, { begin_s, end_s }), pointed: (along) => form?.point(along) });
   const bench = ledger(side, { undo: () => change(history[at].effects.slice(0, -1)), compare });
   draw.signal(signal);
@@ -92,12 +99,25 @@ async function open(main, recording, row, signal) {
         const { held_out: after, floor, unit: of } = history[at].error;
         book.write({ step: more ? "added" : "removed", effects: changed, before: before.error.held_out, after, floor, unit: of });
       }
-      answer = await api.suspects(recording, { axis, board, effects });
-      refresh();
+      if (before) judge(effects);
+      else refresh();
     } catch (problem) {
       if (before && problem.code?.startsWith("formula.")) throw problem;
       say(error, problem);
     } finally { busy = false; }
+  }
+
+  /** What the library says beside the model; a long search holds nothing up, and the last question counts. */
+  async function judge(effects) {
+    const mine = ++judged;
+    refresh();
+    try {
+      const said = await api.suspects(recording, { axis, board, effects });
+      if (mine !== judged) return;
+      if (!answer && !effects.length && !isGuessing.checked) book.write({ step: "verdict", code: said.code, values: said.values });
+      answer = said;
+      refresh();
+    } catch (problem) { if (mine === judged) say(error, problem); }
   }
 
   function drawModel(ms) {
@@ -112,7 +132,11 @@ async function open(main, recording, row, signal) {
   }
 
   function refresh() {
-    if (!answer || !cards.size) return;
+    if (!cards.size || at < 0) return;
+    if (!answer) {
+      if (!isGuessing.checked) showByHand(byHand, cards, history[at], { open: show, toggle });
+      return;
+    }
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
     if (hidden) {
@@ -133,8 +157,13 @@ async function open(main, recording, row, signal) {
     }
     form = null;
     verdict.textContent = answer.sentence;
-    showSuspects(suspectsPlace, answer, { open: show, guess, decide: signal.points ? null : decide, toggle: (effect, isIn) => { const now = history[at].effects; change(isIn ? now.filter((name) => name !== effect) : [...now, effect]); } });
+    showSuspects(suspectsPlace, answer, { open: show, guess, decide: signal.points ? null : decide, toggle });
     if (!cardPlace.querySelector("h2")) show(answer.suspects[0].effect, false);
+  }
+
+  function toggle(effect, isIn) {
+    const now = history[at].effects;
+    return change(isIn ? now.filter((name) => name !== effect) : [...now, effect]);
   }
 
   async function show(effect, isAsked = true) {
@@ -164,6 +193,7 @@ async function open(main, recording, row, signal) {
   document.addEventListener("rig-changed", ({ detail }) => { rigName = detail.simulated ? t("rig.simulated") : detail.url; });
   const next = experimentPanel(nextPlace, {
     ask: () => ({ recording, axis, effects: history[at]?.effects ?? [] }),
+    progress,
     rig: () => (carried.lab ? t("workbench.next.hidden_bench") : rigName),
     async run(experiment) {
       if (!carried.lab) return onRig(experiment);
@@ -191,9 +221,9 @@ async function open(main, recording, row, signal) {
     try {
       book.write({ step: "opened", recording, name, axis, samples: signal.samples, duration_s: signal.duration_s });
       const library = api.effects().then(({ items }) => { for (const card of items) cards.set(card.name, card); });
+      judge([]);
       await Promise.all([library, change([])]);
       refresh();
-      if (answer && !isGuessing.checked) book.write({ step: "verdict", code: answer.code, values: answer.values });
     } catch (problem) { say(error, problem); }
   })();
 }

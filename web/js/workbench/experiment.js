@@ -8,8 +8,8 @@ import { duration, t } from "../text.js";
 const ASK_MS = 400;
 
 /** ask() gives {recording, axis, effects} as they are now; run(experiment, motion) does it and gives the recording of
- * both together; done(recording, verdict) is told of it. */
-export function experimentPanel(place, { ask, run, done, rig }) {
+ * both together; progress() says how far a search is; done(recording, verdict) is told of it. */
+export function experimentPanel(place, { ask, progress, run, done, rig }) {
   const error = h("p", { class: "error", role: "alert" });
   const told = h("div", { class: "stack", "aria-live": "polite" });
   const find = h("button", { type: "button", id: "propose", onclick: propose }, t("workbench.next.find"));
@@ -26,7 +26,7 @@ export function experimentPanel(place, { ask, run, done, rig }) {
   async function propose() {
     clear();
     find.disabled = true;
-    told.replaceChildren(waiting(t("workbench.next.finding")));
+    told.replaceChildren(waiting(t("workbench.next.finding"), progress));
     try {
       const experiment = await api.proposeExperiment(ask());
       const path = await api.experimentMotion(experiment.id);

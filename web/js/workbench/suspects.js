@@ -13,6 +13,18 @@ function length(z, threshold, largest) {
   return QUARTER + (100 - QUARTER) * (Math.log(z / threshold) / Math.log(Math.max(largest / threshold, 4)));
 }
 
+/** While the library is searched: every effect that this recording can show, to be added without waiting for its evidence. */
+export function showByHand(place, cards, model, { open, toggle }) {
+  const isIn = (name) => model.effects.includes(name);
+  const possible = [...cards.values()].filter(({ name }) => model.possible?.includes(name)).sort((a, b) => a.title.localeCompare(b.title));
+  const wasOpen = place.querySelector("details")?.open ?? false;
+  place.replaceChildren(h("details", { open: wasOpen }, h("summary", {}, t("workbench.by_hand")),
+    h("ul", { class: "suspects" }, possible.map(({ name, title }) => h("li", { class: isIn(name) ? "in_model" : null, "data-effect": name },
+      h("button", { type: "button", class: "name", onclick: () => open(name) }, title), h("span", {}),
+      h("button", { type: "button", class: "add", "aria-label": t(isIn(name) ? "workbench.remove_named" : "workbench.add_named", { effect: title }), onclick: () => toggle(name, isIn(name)) },
+        t(isIn(name) ? "workbench.remove" : "workbench.add")))))));
+}
+
 /** Shows `answer` of the server in place. open(effect), toggle(effect, inModel), decide() (null: no motion can) are what its
  * buttons do; `guess` is the effect that the student named. */
 export function showSuspects(place, answer, { open, toggle, decide, guess }) {
