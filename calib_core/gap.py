@@ -48,6 +48,8 @@ class Diagnosis:
     search: Search | None = None
     asked: list[Term] = field(default_factory=list)
     rivals: list[list[Suspicion]] = field(default_factory=list)
+    alternatives: list[list[list[str]]] = field(default_factory=list)
+    """Names that together would serve as well as others together, where the search does not weigh them."""
     candidates: list[dict[str, Any]] = field(default_factory=list)
     clip: gap_saturation.Clip | None = None
     clip_gain: float = 0.0
@@ -90,8 +92,11 @@ def diagnose(
     if "adc_quantization" in pool and coarse is not None:
         answer.coarse = float(str(coarse.values["step"]))
     elif "bias_random_walk" in pool:
-        answer.walk = wandering(search)
-        if answer.walk is not None:
+        walk = wandering(search)
+        if walk is not None and walk.rivals:
+            answer.alternatives.append([["bias_random_walk"], [*walk.rivals]])
+        if walk is not None and walk.named:
+            answer.walk = walk
             # Beside a bias that wanders a step or a drift must be plainer, and the rest may be plainer to see.
             search = Search(search.space, search.suspects, rng, search.chosen[: search.given], columns=search.columns)
             _sought(search)
@@ -111,12 +116,20 @@ def diagnose(
     found = bool(named(search)[len(effects) :]) or any(
         x is not None for x in (answer.hum, answer.clip, answer.walk, answer.coarse)
     )
-    tied = any(len(r) > 1 for r in answer.rivals)
+    answer.alternatives = _standing(answer, search)
+    tied = any(len(r) > 1 for r in answer.rivals) or bool(answer.alternatives)
     if answer.unknown is not None:
         answer.verdict = "unknown"
     else:
         answer.verdict = ("ambiguous" if tied else "missing") if found else "adequate"
     return answer
+
+
+def _standing(answer: Diagnosis, search: Search) -> list[list[list[str]]]:
+    """The alternatives of which one is still what is said."""
+    said = {t.name for t in named(search)} | ({"bias_random_walk"} if answer.walk is not None else set())
+    both = [*answer.alternatives, *search.alternatives]
+    return [sets for sets in both if any(said.issuperset(names) for names in sets)]
 
 
 def named(search: Search) -> list[Term]:

@@ -68,7 +68,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
             if abs(f.z) >= FAILING
         ],
         "missing": missing,
-        "rivals": [[s.term.name for s in r] for r in d.rivals if len(r) > 1],
+        **_ties(d),
         "after": {
             "effects": [*(t.name for t in d.asked), *(m["effect"] for m in missing)],
             "held_out_rms_dps": after.held_out_rms_dps,
@@ -86,6 +86,23 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         "covariate": d.unknown.covariate if d.unknown else None,
     }
     return out | {"code": f"diagnosis.{d.verdict}", "values": values}
+
+
+def _ties(d: Diagnosis) -> dict[str, Any]:
+    """What the record cannot tell apart: single effects, and sets of which some take several."""
+    rivals = [[s.term.name for s in r] for r in d.rivals]
+    sets = []
+    for alternatives in d.alternatives:
+        if any(len(names) > 1 for names in alternatives):
+            sets.append(alternatives)
+            continue
+        singles = [name for names in alternatives for name in names]
+        tie = next((r for r in rivals if set(r) & set(singles)), None)
+        if tie is None:
+            rivals.append(singles)
+        else:
+            tie.extend(name for name in singles if name not in tie)
+    return {"rivals": [r for r in rivals if len(r) > 1], "rival_sets": sets}
 
 
 def _missing(d: Diagnosis) -> list[dict[str, Any]]:

@@ -75,6 +75,8 @@ class Search:
     threshold: float = float("nan")
     columns: dict[str, list[Term]] = field(default_factory=dict)
     """The grid of each suspect, to be shared with other searches of the same space."""
+    alternatives: list[list[list[str]]] = field(default_factory=list)
+    """An effect, and those that together explain the record as well."""
     given: int = field(init=False)
     """So many of the chosen were there from the start."""
 
@@ -335,7 +337,10 @@ class Search:
                 both = self.chi2(self.chosen)
                 for s in ranking[:4]:
                     term, chi2 = self.refined(s.term, others)
-                    if chi2 < both + RIVAL and term.name not in {self.chosen[i].name, self.chosen[j].name}:
+                    pair = [self.chosen[i].name, self.chosen[j].name]
+                    if chi2 < both + RIVAL and term.name not in pair:
+                        if chi2 > both:
+                            self.alternatives.append([[term.name], pair])
                         self.chosen = [*others, term]
                         self.findings = [*self.findings[: len(others)], Finding(s, [s], self.threshold)]
                         break

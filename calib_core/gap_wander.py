@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects.base import Acts
-from calib_core.gap_search import RIVAL, Search
+from calib_core.gap_search import RIVAL, TUNED, Search
 from calib_core.gap_space import Space, Term
 from calib_core.gap_unknown import Unknown
 from calib_core.noise_fit import MAX_CORRELATION_S
@@ -42,13 +42,18 @@ class Walk:
     relative_uncertainty: float
     two_delta_lnL: float
     """Over noise that does not wander, beside the same model."""
+    named: bool
+    """Whether it explains the record better than the slow shapes."""
+    rivals: tuple[str, ...]
+    """The slow shapes that, together, explain the record about as well; none where one side is plainly better."""
 
 
 def wandering(search: Search) -> Walk | None:
-    """The walk that explains the record better than the slow shapes of ``search`` do, the space then having it in its
-    base; or None, and nothing has changed."""
+    """The walk that explains the record better than the slow shapes of ``search`` do, or as well. Where it is named the
+    space has it in its base from then on; otherwise nothing has changed."""
     space, given = search.space, search.given
     kept = [t for k, t in enumerate(search.chosen) if k < given or t.name not in SLOW]
+    slow = tuple(t.name for t in search.chosen[given:] if t.name in SLOW)
     noise = space.noise.noise
     at_limit = noise.ar1 > 0.0 and noise.correlation_time_s > NEAR_LIMIT * MAX_CORRELATION_S
     if len(kept) == len(search.chosen) and not at_limit:
@@ -65,14 +70,21 @@ def wandering(search: Search) -> Walk | None:
     margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * MAX_CORRELATION_S else RIVAL
     # Of what strong slow shapes explain, a share is always their form, which a walk mends without being one.
     margin += FORM * max(plain - now - STRONG, 0.0)
-    if deviance[best] > min(now - margin, plain - EVIDENCE) or not 0 < best < len(size) - 1:
+    gain = now - float(deviance[best]) - margin
+    # A walk's waves are weighed with all their sizes, a shape is at its best: that is worth so much to each shape.
+    near = bool(slow) and abs(gain) < RIVAL + TUNED * len(slow)
+    if deviance[best] > plain - EVIDENCE or not (gain > 0.0 or near) or not 0 < best < len(size) - 1:
         space.use_noise(was)
         return None
+    if gain <= 0.0:
+        space.use_noise(was)
+    else:
+        space.extend(waves.columns, 1.0 / (math.exp(size[best]) * deviations))
     h = float(size[1] - size[0])
     bend = float(deviance[best - 1] - 2.0 * deviance[best] + deviance[best + 1]) / h**2
-    k = math.exp(size[best])
-    space.extend(waves.columns, 1.0 / (k * deviations))
-    return Walk(k, math.sqrt(2.0 / bend) if bend > 0.0 else math.nan, float(plain - deviance[best]))
+    relative = math.sqrt(2.0 / bend) if bend > 0.0 else math.nan
+    evidence = float(plain - deviance[best])
+    return Walk(math.exp(size[best]), relative, evidence, gain > 0.0, slow if near else ())
 
 
 def _series(space: Space) -> tuple[Term, F64]:

@@ -244,6 +244,8 @@ def _limits(answer: Words) -> Iterator[Words]:
 
     for names in answer["rivals"]:
         yield limit("rivals", rivals=effect_words(names, "both"))
+    for one, other in answer["rival_sets"]:
+        yield limit("rival_sets", one=effect_words(one, "both"), other=effect_words(other, "both"))
     if answer["unknown"]:
         yield limit("unknown")
     if answer["code"] == "diagnosis.adequate_above_floor":
