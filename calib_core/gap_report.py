@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib_core.effects import Acts
+from calib_core.effects import Acts, Covariates
 from calib_core.gap import Diagnosis, on_grid, p_value
 from calib_core.gap_error import Explanation
 from calib_core.gap_search import equivalent_z
 from calib_core.integral_fit import SUFFIX
+
+F64 = NDArray[np.float64]
 
 FAILING = 4.0
 """|z| from which a stretch is said to fail."""
@@ -42,6 +45,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         "unknown": None,
         "next_experiment": None,
         "after": None,
+        "reach": None,
     }
     if d.search is None or d.before is None or d.after is None:
         failed = next((c for c in d.checks if c.blocking and not c.ok), None)
@@ -74,6 +78,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
             "held_out_rms_dps": after.held_out_rms_dps,
             "parameters": parameters(d.after),
         },
+        "reach": reach(space.covariates),
     }
     out["model"] |= {"parameters": parameters(d.before), "reference": dict(space.covariates.reference)}
     if d.unknown is not None:
@@ -103,6 +108,22 @@ def _ties(d: Diagnosis) -> dict[str, Any]:
         else:
             tie.extend(name for name in singles if name not in tie)
     return {"rivals": [r for r in rivals if len(r) > 1], "rival_sets": sets}
+
+
+def reach(c: Covariates) -> dict[str, float | None]:
+    """How far the motion went: fastest rate, the angle's ends, spans of temperature and supply, and of time."""
+
+    def span(values: F64 | None, factor: float = 1.0) -> float | None:
+        return None if values is None else factor * float(np.ptp(values))
+
+    return {
+        "rate_dps": float(np.quantile(np.abs(c.rate_dps), 0.999)),
+        "low_deg": float(c.position_deg.min()),
+        "high_deg": float(c.position_deg.max()),
+        "temperature_degC": span(c.temperature_c),
+        "supply_mV": span(c.supply_v, 1e3),
+        "duration_s": float(c.time_s[-1]),
+    }
 
 
 def _missing(d: Diagnosis) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
+from server import untested
 from server.texts import render, texts
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ CERTAIN, LIKELY = 1e-6, 1e-3
 ABOVE_FLOOR = 1.1
 STANDS_OUT = 10.0
 """2ΔlnL by which one effect of a few stands out from noise."""
-NEVER = ("input_loading",)
-"""No recording shows it: it hides in bias and scale factor, and only the datasheet tells of it."""
 STILL = {"rate": 0.5, "acceleration": 0.5, "other_rate": 0.5}
 """Below this a covariate is said to stand still."""
 KINDS = {
@@ -186,8 +185,11 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
     verdict = answer["verdict"]
     joint = "bracketed" if verdict == "ambiguous" and len(answer["missing"]) > 1 else "either"
     findings = [effect_words(tied.get(m["effect"], [m["effect"]]), joint) for m in answer["missing"]]
-    values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": _joined("both", findings)}
+    values = {"before": before, "after": after, "floor": floor, "unit": unit, "effects": joined("both", findings)}
     values["count"] = sum(candidate["status"] == "not_excited" for candidate in answer["candidates"])
+    if answer.get("reach"):
+        values["count"] = len(untested.rows(answer["candidates"]))
+        values["why"] = untested.reasons(answer["candidates"], answer["reach"])
     if verdict == "unknown":
         values["along"] = along(answer["unknown"]["covariate"])
         verdict = "unknown_beside" if findings else "unknown"
@@ -198,7 +200,7 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
     elif verdict == "adequate" and before > ABOVE_FLOOR * floor:
         verdict = "adequate_above_floor"
     elif verdict == "adequate" and values["count"]:
-        verdict = "adequate_partly"
+        verdict = "adequate_untested" if "why" in values else "adequate_partly"
     return {"code": f"diagnosis.{verdict}", "values": values}
 
 
@@ -260,7 +262,7 @@ def _limits(answer: Words) -> Iterator[Words]:
         yield limit("reference")
         yield limit("no_time")
     for status in ("not_excited", "no_data") if timed else ("not_excited",):
-        names = [c["effect"] for c in answer["candidates"] if c["status"] == status and c["effect"] not in NEVER]
+        names = [c["effect"] for c in untested.rows(answer["candidates"]) if c["status"] == status]
         if names:
             yield limit(status, effects=[effect_word(name) for name in names])
 
@@ -307,10 +309,11 @@ def effect_word(name: str) -> object:
 
 def effect_words(names: Sequence[str], joint: str = "either") -> Any:
     """Names in words, the last after "or" (``either``) or "and" (``both``)."""
-    return _joined(joint, [effect_word(name) for name in names])
+    return joined(joint, [effect_word(name) for name in names])
 
 
-def _joined(joint: str, words: Sequence[object]) -> Any:
+def joined(joint: str, words: Sequence[object]) -> Any:
+    """Words in a row, the last after what ``joint`` says: "either", "both", "bracketed"."""
     if len(words) < 2:
         return list(words)
     if joint == "either" and len(words) > 2:

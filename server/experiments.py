@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_core.problem import Problem
-from server import diagnosis
+from server import diagnosis, untested
 from server.compute import tell
 
 if TYPE_CHECKING:
@@ -133,9 +133,23 @@ def proposed(
         answer = diagnosis.of_recording(hand, axis=axis, effects=effects, suspects=suspects, axes=known, told=tell)
         following = answer["next_experiment"]
         if following is None:
-            raise Problem("experiment.nothing_open", axis=axis)
+            raise _settled(answer)
         row = store.experiments.add(recording, axis, effects, {**following, "verdict": answer["verdict"], "rig": rig})
         return str(row["id"])
+
+
+def _settled(answer: Mapping[str, Any]) -> Problem:
+    """Why no motion is proposed: nothing is open, or what is needs more than motion."""
+    left, needed = (
+        untested.rows(answer["candidates"]),
+        diagnosis.joined("both", list(untested.needed(answer["candidates"]))),
+    )
+    effects = diagnosis.effect_words([row["effect"] for row in left], "both")
+    if needed:
+        return Problem("experiment.needs_data", axis=answer["axis"], effects=effects, needed=needed)
+    if left:
+        return Problem("experiment.nothing_shows", axis=answer["axis"], effects=effects)
+    return Problem("experiment.nothing_open", axis=answer["axis"])
 
 
 def create(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib_core.problem import Problem
-from server import diagnosis, workbench_points
+from server import diagnosis, untested, workbench_points
 from server.compute import tell
 from server.live import encode
 from server.texts import render, texts
@@ -184,16 +184,23 @@ def _listed(
     for name, row in rows.items():
         row["tie"] = next((k for k, names in enumerate(ties) if name in names), None)
         row["in_model"], row["can_be_added"] = name in effects, name in possible
-        row |= _evidence(row, threshold, tested)
+        row |= _evidence(row, threshold, tested, answer.get("reach"))
         row["sentence"] = render(row["code"], row["values"], lang)
         row["title"] = texts(lang).get(f"effects.{name}.name", name)
     order = sorted(
         rows.values(), key=lambda r: (not r["in_model"], r["status"] != "tested", -(r["z"] or 0.0), r["effect"])
     )
+    left = _untested_said(answer, lang)
     if effects:
         answer = answer | _beside_said(order, lang)
     verdict = {key: answer[key] for key in ("verdict", "sentence", "code", "values", "checks", "limits", "unknown")}
-    return dict(diagnosis.plain({**verdict, "threshold": threshold, "suspects": order}))
+    return dict(diagnosis.plain({**verdict, "threshold": threshold, "untested": left, "suspects": order}))
+
+
+def _untested_said(answer: Words, lang: str) -> str:
+    """What this recording could not test, and why; empty where it could test everything."""
+    values = {name: answer["values"].get(name) for name in ("count", "why")}
+    return render("workbench.untested", values, lang) if values["why"] else ""
 
 
 def _beside_said(order: Sequence[Words], lang: str) -> Words:
@@ -262,7 +269,7 @@ def _z(evidence: Mapping[str, Any]) -> float | None:
     return float(-ndtri(evidence["p"] / 2.0))
 
 
-def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
+def _evidence(row: Mapping[str, Any], threshold: float, tested: int, reach: Mapping[str, Any] | None = None) -> Words:
     """A word for how sure it is, and the code and values of its sentence."""
     from calib_core.gap import BY_ITSELF
 
@@ -271,6 +278,9 @@ def _evidence(row: Mapping[str, Any], threshold: float, tested: int) -> Words:
         word = "in_model"
     elif row["status"] != "tested":
         word = row.get("word", row["status"])
+        if reach and word in ("not_excited", "no_data") and row["effect"] not in untested.NEVER:
+            values = {"why": untested.why(row, reach)}
+            return {"word": word, "code": "workbench.evidence.untested", "values": values}
     elif apart and not row["two_delta_lnL"]:
         return {"word": "nothing", "code": "workbench.evidence.by_itself", "values": {}}
     elif apart or row["z"] >= threshold:

@@ -10,11 +10,12 @@ from running import Server
 from shared import ROOT
 
 from calib_core import points
+from calib_core.effects import library
 from calib_core.recording import write_csv
-from server import cli, diagnosis
+from server import cli, diagnosis, untested
 from server.bench.gap_campaign import as_recording
 from server.bench.gap_records import record
-from server.texts import LANGUAGES
+from server.texts import LANGUAGES, texts
 
 KEYS = {
     "recording", "axis", "unit", "verdict", "sentence", "code", "values", "checks", "model", "noise", "error",
@@ -113,6 +114,30 @@ def test_verdicts_are_words_that_say_evidence_and_limits() -> None:
     assert "cannot tell delay between gyro and encoder and lag of the sensor apart" in limits[0]
     assert limits[1].endswith("sensitivity to the other axis.")
     assert limits[2].endswith("my_own.")
+
+
+def test_a_model_that_explains_its_recording_says_what_was_not_tested_and_why() -> None:
+    reach = {
+        "rate_dps": 47.123, "low_deg": -30.02, "high_deg": 30.01,
+        "temperature_degC": 0.0213, "supply_mV": None, "duration_s": 68.0,
+    }  # fmt: skip
+    names = {"bias_temperature": "not_excited", "scale_factor_cubic": "not_excited", "supply_sensitivity": "no_data"}
+    rows = [{"effect": name, "status": status} for name, status in {**names, "input_loading": "no_data"}.items()]
+    error = {"held_out_rms_dps": 0.043, "floor_rms_dps": 0.0428}
+    told = said(reach=reach, error=error, candidates=[*rows, {"effect": "bias_drift", "status": "tested"}])
+    assert told["sentence"].endswith(
+        "But it could not test 3 effects: the temperature moved only by 0.021 °C, the supply was not recorded, "
+        "nothing turned faster than 47 deg/s."
+    )
+    assert "could not" not in said(reach=reach, error=error, candidates=[rows[-1]])["sentence"]
+
+
+def test_every_effect_that_a_motion_can_show_has_a_reason_where_it_did_not() -> None:
+    told = {name for names in untested.TOLD_BY.values() for name in names}
+    assert told == set(library()) - {*untested.NEVER}
+    for name in (*untested.TOLD_BY, "other"):
+        parts = ("", "no_") if name in (*untested.RECORDED, "other") else ("",)
+        assert all(f"untested.{part}{name}" in texts("th") for part in parts)
 
 
 def test_no_p_value_is_in_a_sentence() -> None:

@@ -5,6 +5,11 @@ from typing import Any
 
 import pytest
 from browser import PHONE, Server, Window, serious, serving
+from recordings import csv_bytes, csv_lines, to_csv
+
+from calib_core.excitation import Excitation, plan_of
+from server import engine
+from server.devices import open_rig
 
 LIMIT_KB = 300
 
@@ -22,6 +27,27 @@ def opened(server: Server) -> str:
     path = f"/recordings/{made['recording']}"
     server.call("GET", f"{path}/suspects?axis=x", seconds=120)  # looked through once; pages then come at once
     return f"/workbench.html?recording={made['recording']}&axis=x"
+
+
+@pytest.fixture(scope="module")
+def healthy() -> bytes:
+    """Twenty seconds of a slow sine of a gyro that lacks nothing, as a file."""
+    rig = open_rig("twin:?seed=1&covariates=1")
+    rig.open()
+    plan = plan_of([Excitation("x", "sine", 19.9, (30.0,), (0.2513,))], experiment="hand", axis="x")
+    return to_csv(engine.record(plan, rig, board="LPY-W"))
+
+
+def drop(page: Any, name: str, content: bytes) -> None:
+    """As a file that is let go over the page."""
+    given = page.evaluate_handle(
+        "([name, text]) => { const held = new DataTransfer(); held.items.add(new File([text], name)); return held; }",
+        [name, content.decode()],
+    )
+    for event in ("dragenter", "dragover"):
+        page.dispatch_event("main", event, {"dataTransfer": given})
+    page.wait_for_selector(".drop.over")
+    page.dispatch_event("main", "drop", {"dataTransfer": given})
 
 
 @pytest.fixture
@@ -60,6 +86,62 @@ def test_an_example_opens_with_pictures_words_and_suspects(window: Window) -> No
     assert "cannot tell" in window.text(".verdict")
     assert page.locator(".about svg").count() == 1
     assert page.locator(".suspects .no_data .add").count() == 0
+
+
+def test_a_dropped_recording_is_opened_and_a_fit_that_leaves_nothing_says_what_it_could_not_test(
+    window: Window, healthy: bytes
+) -> None:
+    page = window.open("/workbench.html")
+    drop(page, "sine.csv", healthy)
+    page.wait_for_selector(".says .limits:has-text('could not test')", timeout=60_000)
+    assert "leaves nothing but noise" in window.text(".says")
+    assert "nothing turned faster than 4" in window.text(".says")
+    assert "could not test" in window.text(".verdict")
+    page.click(".list details summary")
+    assert "the temperature moved only by" in window.text("[data-effect=bias_temperature]")
+    page.click("#propose:has-text('tests the rest')")
+    page.wait_for_selector("#run-experiment", timeout=60_000)
+    assert "cubic scale factor" in window.text("section:has(> div > #propose)")
+
+
+def test_a_bad_file_is_refused_where_it_was_dropped_and_a_better_one_still_goes(browser: Any, server: Server) -> None:
+    window = Window(browser, server)
+    page = window.open("/workbench.html")
+    lines = csv_lines()
+    drop(page, "bad.csv", csv_bytes([*lines[:5], lines[3], *lines[6:]]))
+    page.wait_for_selector(".error:has-text('Line 6, column time_s')")
+    assert page.locator(".drop.over").count() == 0
+    assert page.is_enabled("#file")
+    drop(page, "nothing.csv", b"not a recording")
+    page.wait_for_selector(".error:not(:has-text('Line 6'))")
+    window.close(refusals=2)
+
+
+def test_a_model_is_saved_named_exported_and_stated_on_a_certificate(window: Window, server: Server) -> None:
+    server.call("POST", "/runs", {"board": "LPY-K", "readings": 3, "seed": 1})
+    server.wait_idle()
+    page = window.open("/workbench.html")
+    page.fill("#search", "LPY-K")
+    page.click("tbody a:has-text('LPY-K')")
+    page.wait_for_selector("#held-out:has-text('deg/s')", timeout=60_000)
+    page.click(".list details summary")  # by hand, whether the library has been looked through or not
+    page.click("[data-effect=hysteresis] .add")
+    page.wait_for_selector(".steps-bought li:nth-child(2)")
+    page.fill("#model-name", "with hysteresis")
+    page.click("text=Save")
+    page.wait_for_selector("text=Saved as with hysteresis")
+    code = {}
+    for kind in ("JSON", "C", "Python"):
+        with page.expect_download() as download:
+            page.click(f"section:has(#model-name) a:text-is('{kind}')")
+        code[kind] = download.value.path().read_text(encoding="utf-8")
+    assert "hysteresis.h" in code["JSON"]
+    assert "double " in code["C"]
+    assert "def " in code["Python"]
+    page.click("text=Certificate with this model")
+    number = page.locator("a:has-text('is issued')").inner_text().split()[1]
+    stated = server.call("GET", f"/certificates/{number}.json")["compensation"]
+    assert (stated["name"], stated["axis"]) == ("with hysteresis", "x")
 
 
 def test_the_signal_is_there_within_a_second(window: Window, opened: str) -> None:
@@ -127,6 +209,9 @@ def test_guessing_hides_the_evidence_until_a_picture_and_a_cause_are_named(windo
     page.wait_for_selector(".suspects .guessed:has-text('Your guess')")
     page.wait_for_selector(".lines:has-text('it grows with acceleration')")
     assert "the acceleration of x" in window.text(".lines")
+    with page.expect_download() as download:
+        page.click("text=Notebook as PDF")
+    assert download.value.path().read_bytes().startswith(b"%PDF")
 
 
 def test_the_motion_that_decides_is_shown_run_and_judged_with_the_data_in_hand(window: Window, opened: str) -> None:

@@ -137,6 +137,8 @@ async function open(main, recording, row, signal) {
       if (!isGuessing.checked) showByHand(byHand, cards, history[at], { open: show, toggle });
       return;
     }
+    draw.limits(answer.untested);
+    next.label(answer);
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
     if (hidden) {
@@ -158,7 +160,10 @@ async function open(main, recording, row, signal) {
     form = null;
     verdict.textContent = answer.sentence;
     showSuspects(suspectsPlace, answer, { open: show, guess, decide: signal.points ? null : decide, toggle });
-    if (!cardPlace.querySelector("h2")) show(answer.suspects[0].effect, false);
+    if (cardPlace.querySelector("h2")) return;
+    // Of many that noise explains none is to be put before a reader.
+    if (answer.suspects[0].word === "nothing") cardPlace.replaceChildren(h("p", { class: "muted" }, t("workbench.card.choose")));
+    else show(answer.suspects[0].effect, false);
   }
 
   function toggle(effect, isIn) {

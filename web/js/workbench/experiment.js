@@ -59,7 +59,14 @@ export function experimentPanel(place, { ask, progress, run, done, rig }) {
       go.textContent = t("workbench.next.run", { rig: rig() });
     }
   }
-  return { propose };
+  return {
+    propose,
+    /** What the button is called: rivals are to be told apart, or what this motion hardly shows is to be tested. */
+    label: ({ suspects }) => {
+      const isTied = suspects.some(({ tie }) => tie !== null);
+      find.textContent = t(!isTied && suspects.some(({ word }) => word === "not_excited") ? "workbench.next.find_more" : "workbench.next.find");
+    },
+  };
 }
 
 /** Runs a proposed experiment on the rig that is chosen, and waits for the verdict on all data together. */

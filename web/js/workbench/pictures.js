@@ -26,6 +26,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
   let waiting = 0;
   let compared = null;
   let isHiding = false;
+  let untested = null;
 
   const overlay = chart(traces, {
     name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t(points ? "chart.gyro" : "chart.output"), unit, digits: points ? 3 : 4 },
@@ -101,7 +102,9 @@ export function pictures(place, { unit, points, detail, pointed }) {
       shade: failures.slice(0, 1).filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
     });
     residual.rename(compared ? t("workbench.residual_two") : t(points ? "workbench.residual_points" : "workbench.residual"), t("chart.residual"));
-    sentence.textContent = isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits");
+    sentence.replaceChildren(isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits"));
+    // A fit that leaves nothing is read as "nothing is there": how far it holds belongs to it.
+    if (!isHiding && !failures.length) sentence.append(" ", h("span", { class: "limits" }, untested ?? t("workbench.untested_waiting")));
     for (const one of along) {
       if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
       const { plot, says, figure } = multiples.get(one.covariate);
@@ -130,6 +133,12 @@ export function pictures(place, { unit, points, detail, pointed }) {
       [shown, compared] = [fit, other];
       drawSignal(fit);
       draw();
+    },
+    /** What the recording could not test, in words. */
+    limits(text) {
+      if (untested === text) return;
+      untested = text;
+      if (shown) draw();
     },
     /** In guessing, each picture can be pointed at. */
     pointing(on, covariate = null) {
