@@ -8,13 +8,14 @@ from the store.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 from calib_core import session
 from calib_core.certificate import judge, limits
 from calib_core.gyro_models import GyroModel
+from calib_core.problem import Problem
 from calib_core.recording import Recording
 from calib_core.reference import HEADER, ReferenceCalibration
 from calib_core.sequence import PROFILES, STATES
@@ -36,11 +37,12 @@ def certify(
     *,
     gyro_model: GyroModel | None = None,
     spec: Mapping[str, Any] | None = None,
-    compensation: Mapping[str, Any] | None = None,
+    compensation: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """Analyses a stored recording and issues its certificate; the issued content, number included.
 
-    ``compensation`` (a saved model as ``compensated_by`` gives it): the axis is certified with its effects taken out.
+    ``compensation`` (saved models as ``compensated_by`` gives them): their axes are certified with the effects taken
+    out.
 
     Raises Problem where the recording, the specification or the store does not allow it; then nothing is issued.
     """
@@ -57,7 +59,7 @@ def content(
     *,
     gyro_model: GyroModel | None = None,
     spec: Mapping[str, Any] | None = None,
-    compensation: Mapping[str, Any] | None = None,
+    compensation: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """What a certificate says, without number and date of issue."""
     if spec is not None:
@@ -95,7 +97,8 @@ def content(
         "spec": spec,
         "verdict": verdict,
         "judgement": judgement,
-        **({} if compensation is None else {"compensation": dict(compensation)}),
+        **({"compensation": dict(compensation[0])} if len(compensation) == 1 else {}),
+        **({"compensation": [dict(one) for one in compensation]} if len(compensation) > 1 else {}),
     }
 
 
@@ -107,13 +110,25 @@ def compensated_by(saved: Mapping[str, Any]) -> dict[str, Any]:
     return told | {"model": saved["id"], "name": saved["name"], "error": saved["error"], "software": saved["software"]}
 
 
-def _without(recording: Recording, compensation: Mapping[str, Any] | None) -> Recording:
-    if compensation is None:
+def taken_out(certificate: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The saved models that a certificate's axes were freed of: it states one, or a list of several."""
+    stated = certificate.get("compensation") or []
+    return [stated] if isinstance(stated, Mapping) else list(stated)
+
+
+def _without(recording: Recording, compensation: Sequence[Mapping[str, Any]]) -> Recording:
+    if not compensation:
         return recording
     from calib_core.compensation import Compensation
     from calib_core.corrected import corrected
 
-    return corrected(recording, Compensation.from_json(compensation))
+    models = [Compensation.from_json(one) for one in compensation]
+    for k, model in enumerate(models):
+        if model.axis in (other.axis for other in models[:k]):
+            raise Problem("compensation.same_axis", axis=model.axis)
+    for model in models:
+        recording = corrected(recording, model)
+    return recording
 
 
 def verify(certificate: Mapping[str, Any], recording: Recording) -> dict[str, Any]:
@@ -126,7 +141,7 @@ def verify(certificate: Mapping[str, Any], recording: Recording) -> dict[str, An
         known["id"],
         gyro_model=GyroModel.from_json(certificate["gyro_model"]),
         spec=certificate["spec"],
-        compensation=certificate.get("compensation"),
+        compensation=taken_out(certificate),
     )
     names = ("axes", "verdict", "judgement", "profile", "board")
     differences = [found for name in names for found in _compare(name, certificate[name], again[name])]

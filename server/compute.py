@@ -169,17 +169,24 @@ def comparison(data: Path, recording: str, axis: str, max_points: int) -> dict[s
         return dict(comparison.of_session(store.recording(recording), axis, max_points=max_points))
 
 
-def certify(data: Path, recording: str, model: str | None, spec: Mapping[str, Any] | None) -> dict[str, Any]:
-    """``model``: a gyro model, or a saved model whose effects are taken out first."""
+def certify(
+    data: Path, recording: str, model: str | None, spec: Mapping[str, Any] | None, models: Sequence[str] = ()
+) -> dict[str, Any]:
+    """``model``: a gyro model, or a saved model whose effects are taken out first; ``models``: more of these."""
     from server import certify as room
     from server.store import Store
 
     with Store(data) as store:
         if model is not None and model in store.models:
-            saved = room.compensated_by(store.models.get(model))
-            return dict(room.certify(store, recording, spec=spec, compensation=saved))
+            models, model = [model, *models], None
+        # The same models in another order give the same certificate.
+        saved = sorted((room.compensated_by(store.models.get(one)) for one in dict.fromkeys(models)), key=_axis)
         gyro_model = store.gyro_models.get(model) if model else None
-        return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec))
+        return dict(room.certify(store, recording, gyro_model=gyro_model, spec=spec, compensation=saved))
+
+
+def _axis(compensation: Mapping[str, Any]) -> str:
+    return str(compensation["axis"])
 
 
 def diagnose(

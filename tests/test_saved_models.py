@@ -111,6 +111,22 @@ def test_a_certificate_by_a_model_states_its_terms_and_is_computed_again(data: P
             store.models.get(row["id"])
 
 
+def test_a_certificate_takes_one_model_an_axis(data: Path) -> None:
+    one, other = saved(data, "scale_factor_cubic"), saved(data)
+    with pytest.raises(Problem, match=r"compensation\.same_axis"):
+        certified(data, recording_in(data), one["id"], None, [other["id"]])
+    again = certified(data, recording_in(data), None, None, [one["id"], one["id"]])
+    assert again["number"] == certified(data, recording_in(data), one["id"], None)["number"]
+    several = {
+        **again,
+        "compensation": [again["compensation"], {**again["compensation"], "axis": "z", "name": "bent z"}],
+    }
+    text = next(s["text"] for s in page(several, "en")["statements"] if "scale_factor_cubic.k" in s["text"])
+    assert "axis x" in text
+    assert "bent z" in text
+    assert render(several, "csv").count(b"compensation,") == 2 * len(again["compensation"]["parameters"])
+
+
 def test_a_model_of_another_board_axis_or_unit_corrects_nothing(data: Path, session: Recording) -> None:
     compensation = compensation_of(saved(data))
     moved = {**session.header, "board": "LPY-4"}

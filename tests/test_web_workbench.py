@@ -118,7 +118,7 @@ def test_a_bad_file_is_refused_where_it_was_dropped_and_a_better_one_still_goes(
 
 
 def test_a_model_is_saved_named_exported_and_stated_on_a_certificate(window: Window, server: Server) -> None:
-    server.call("POST", "/runs", {"board": "LPY-K", "readings": 3, "seed": 1})
+    server.call("POST", "/runs", {"board": "LPY-K", "states": ["estimate_x", "estimate_z"], "seed": 1})
     server.wait_idle()
     page = window.open("/workbench.html")
     page.fill("#search", "LPY-K")
@@ -138,10 +138,16 @@ def test_a_model_is_saved_named_exported_and_stated_on_a_certificate(window: Win
     assert "hysteresis.h" in code["JSON"]
     assert "double " in code["C"]
     assert "def " in code["Python"]
+    page.click("nav[aria-label=Axis] >> text=z")
+    page.wait_for_selector("#held-out:has-text('deg/s')", timeout=60_000)
+    page.fill("#model-name", "straight")
+    page.click("text=Save")
+    assert page.is_checked("#also-x")
     page.click("text=Certificate with this model")
     number = page.locator("a:has-text('is issued')").inner_text().split()[1]
     stated = server.call("GET", f"/certificates/{number}.json")["compensation"]
-    assert (stated["name"], stated["axis"]) == ("with hysteresis", "x")
+    assert [(one["name"], one["axis"]) for one in stated] == [("with hysteresis", "x"), ("straight", "z")]
+    assert server.call("GET", f"/certificates/{number}/verify")["valid"]
 
 
 def test_the_signal_is_there_within_a_second(window: Window, opened: str) -> None:

@@ -24,7 +24,8 @@ def certificates(
 
 @router.post("", status_code=201, summary="Certify a stored recording", responses=declared(404))
 async def issue(body: models.CertificateBody, here: Here) -> models.Certificate:
-    content = await here.compute.run(compute.certify, here.store.data, body.recording, body.model, body.spec)
+    asked = (body.recording, body.model, body.spec, body.models)
+    content = await here.compute.run(compute.certify, here.store.data, *asked)
     return models.Certificate.model_validate(content)
 
 

@@ -230,6 +230,7 @@ class Recordings(Plain):
 class CertificateBody(Body):
     recording: str = Field(max_length=64)
     model: ModelId | None = Field(None, description="a gyro model, or a saved model whose effects are taken out first")
+    models: list[ModelId] = Field([], max_length=3, description="saved models, of one axis each")
     spec: dict[str, Any] | None = None
 
 

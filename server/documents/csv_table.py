@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from calib_core.certificate import FIELDS, MEASURED
+from server.certify import taken_out
 from server.documents import warning_sentence
 
 COLUMNS = (
@@ -40,10 +41,10 @@ def _rows(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
             row = {"section": "result", "axis": axis, "name": ".".join(field.path), "unit": _unit(field.path[-1])}
             measured = figures[field.path[0]] if field.measured else {"value": value}
             yield row | {key: measured[key] for key in measured if key in COLUMNS}
-    told = content.get("compensation") or {"axis": "", "parameters": []}
-    for parameter in told["parameters"]:
-        row = {"section": "compensation", "axis": told["axis"]}
-        yield row | {key: parameter[key] for key in ("name", "value", "unit", "standard_uncertainty")}
+    for told in taken_out(content):
+        for parameter in told["parameters"]:
+            row = {"section": "compensation", "axis": told["axis"]}
+            yield row | {key: parameter[key] for key in ("name", "value", "unit", "standard_uncertainty")}
     for name, state in content["states"].items():
         for test, points in state.get("points", {}).items():
             for point in points:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_core.certificate import FIELDS, TEST_DECIMALS, Field, two_digits
+from server.certify import taken_out
 from server.documents import compensation_words, figure_name, warning_sentence
 from server.texts import render
 
@@ -285,8 +286,10 @@ def _statements(content: Mapping[str, Any], lang: str) -> Iterator[tuple[str, st
         return render(f"certificate.{key}", values, lang)
 
     yield "method", " ".join([say(f"method.{content['profile']}"), say("method.tests")])
-    if content.get("compensation"):
-        yield "compensation", inert(say("compensation.text", **compensation_words(content["compensation"])))
+    models = taken_out(content)
+    if models:
+        said = " ".join(say("compensation.text", **compensation_words(one)) for one in models)
+        yield "compensation", inert(said)
     calibrated = content["rig"]["reference_calibration"]
     reference = "calibrated" if calibrated else "uncalibrated"
     yield "traceability", say(f"traceability.{reference}", reference=inert(calibrated))

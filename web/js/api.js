@@ -167,6 +167,7 @@ export const api = {
   suspects: (recording, { effects, ...q }) => call("GET", `/recordings/${id(recording)}/suspects${query({ ...q, effects: effects.join(",") })}`),
   progress: (recording, axis) => call("GET", `/recordings/${id(recording)}/progress${query({ axis })}`),
   keepEffect: (own) => call("POST", "/effects", own),
+  models: (q) => call("GET", `/models${query(q)}`),
   saveModel: (body) => call("POST", "/models", body),
   experimentMotion: (experiment) => call("GET", `/experiments/${id(experiment)}/motion`),
   proposeExperiment: (body) => call("POST", "/experiments", body),

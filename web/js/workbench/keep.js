@@ -20,23 +20,31 @@ export function keepPanel(place, { ask, isSession }) {
       told.replaceChildren(h("p", {}, t("workbench.keep.kept", { name: model.name })),
         h("div", { class: "row" },
           ["json", "h", "py"].map((kind) => h("a", { class: "button", href: links.model(model.id, kind), download: "" }, t(`workbench.keep.${kind}`))),
-          isSession ? certify(model) : null));
+          isSession ? await certify(model) : null));
     } catch (problem) { say(error, problem); }
   }
 
-  function certify(model) {
+  /** The button, and beside it the newest model of each other axis, which may go onto the same certificate. */
+  async function certify(model) {
+    const others = new Map();
+    for (const one of (await api.models({ recording: model.recording })).items) if (one.axis !== model.axis && !others.has(one.axis)) others.set(one.axis, one);
+    const also = [...others.values()].map((one) => {
+      const box = h("input", { type: "checkbox", id: `also-${one.axis}`, value: one.id, checked: true });
+      return [box, h("label", { class: "row check", for: box.id }, box, t("workbench.keep.also", one))];
+    });
     const button = h("button", {
       type: "button",
       onclick: async () => {
         say(error, null);
         button.disabled = true;
         try {
-          const { number } = await api.certify({ recording: model.recording, model: model.id });
+          const models = [model.id, ...also.filter(([box]) => box.checked).map(([box]) => box.value)];
+          const { number } = await api.certify({ recording: model.recording, models });
           button.replaceWith(h("a", { class: "button", href: links.document(number, "pdf"), download: "" }, t("certificates.certified", { number })));
         } catch (problem) { say(error, problem); button.disabled = false; }
       },
     }, t("workbench.keep.certify"));
-    return button;
+    return [button, ...also.map(([, label]) => label)];
   }
 
   place.replaceChildren(h("h2", {}, t("workbench.keep.title")),
