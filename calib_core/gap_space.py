@@ -145,14 +145,15 @@ class Space:
         """In which columns are kept."""
         return np.float32 if len(self.rows) > LONG else np.float64
 
-    def refit_noise(self, terms: Iterable[Term]) -> None:
-        """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew.
+    def refit_noise(self, terms: Iterable[Term], guess: RowNoise | None = None) -> None:
+        """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew. Coloured noise
+        is looked for about the ``guess``, or widely.
 
         The codes' error is a sawtooth, not white; overstated, it leaves nothing for AR(1) noise to pose as.
         """
         columns = np.column_stack([self.base, *(t.columns for t in terms)])
         rows = replace(self.rows, reading_variance=OVERSTATED * self.rows.reading_variance)
-        noise = fit_noise(rows, self.residual, columns, self.scale_factor, RowNoise(self.rough_noise))
+        noise = fit_noise(rows, self.residual, columns, self.scale_factor, RowNoise(self.rough_noise), None, guess)
         least = math.log(self._least_noise)
         if noise.logarithms[0] < least:
             # Without rests the encoder's error hides the gyro's noise, but not from the output's own scatter.

@@ -6,7 +6,7 @@ encoder, and the difference of the two would be the gyro's own noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from calib_core.condense import Operator
 from calib_core.effects.base import Acts, Effect, Stage
 from calib_core.gap_search import equivalent_z
-from calib_core.gap_space import FEIGNED_STEPS, TOGETHER, Space, Term
+from calib_core.gap_space import FEIGNED_STEPS, LONG, TOGETHER, Space, Term
 
 F64 = NDArray[np.float64]
 
-CERTAIN = 4.0
-"""The |z| that a shape must reach: one healthy record in thousands does, over all five covariates."""
+CERTAIN = 3.5
+"""The |z| that a shape must reach: three healthy records in a thousand do, over all six covariates."""
 HARMONICS = range(3, 13)
+UNFEIGNED = ("temperature_c", "time_s", "other_rate_dps")
+"""What goes on for many seconds, or with the other axis, the codes of this one do not feign."""
 SINCE_REVERSAL_S = (0.0, 0.1, 0.3, 1.0, 3.0)
 
 
@@ -40,11 +42,36 @@ class Structure:
     term: Term
     gain: float
     z: float
+    """Of what the encoder's codes could not feign, as the gain is."""
+    plain: float
+    """The |z| with it: what follows one covariate is seen along others too, but less."""
 
 
 def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
-    """Every covariate's shape beside base and ``chosen``, the most certain first."""
-    found = []
+    """Every covariate's shape beside base and ``chosen``: what is certain first, and of that what explains most."""
+    bases: Iterable[tuple[str, F64]] = _bases(space)
+    was = space.noise
+    if was.noise.ar1 > 0.0 and len(space.rows) <= LONG:
+        # What has no name yet is in no model, and poses as noise that is correlated over seconds.
+        bases = list(bases)
+        held = np.column_stack([space.base, *(t.columns for t in chosen)])
+        fast = [columns for name, columns in bases if name != "time_s"]
+        if fast:
+            space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))], guess=was.noise)
+    found = list(_tested(space, chosen, bases))
+    if space.noise is not was:
+        space.use_noise(was)
+    return sorted(found, key=lambda s: (s.z < CERTAIN, -s.plain))
+
+
+def _bases(space: Space) -> Iterator[tuple[str, F64]]:
+    for name, shapes in _shapes(space):
+        columns = _basis(shapes, space.base)
+        del shapes
+        yield name, columns
+
+
+def _tested(space: Space, chosen: Sequence[Term], bases: Iterable[tuple[str, F64]]) -> Iterator[Structure]:
     held = np.column_stack([space.white(space.base), *(space.whitened(t) for t in chosen)])
     prior = np.zeros((len(space.prior), held.shape[1]))
     np.fill_diagonal(prior, space.prior)
@@ -54,9 +81,7 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
     residual = space.white(space.residual)
     residual = residual - own @ (own.T @ residual)
     space.forget()
-    for covariate, shapes in _shapes(space):
-        columns = _basis(shapes, space.base)
-        del shapes
+    for covariate, columns in bases:
         if not columns.shape[1]:
             continue
         free = space.white(columns)
@@ -64,12 +89,16 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
         block = free.T @ free
         inverse = np.linalg.pinv(block, rcond=1e-6, hermitian=True)
         value = inverse @ (free.T @ residual)
-        gain = float(value @ np.linalg.pinv(inverse + np.diag(_slack(space, columns)), 1e-12, hermitian=True) @ value)
-        z = float(equivalent_z(gain, int(np.linalg.matrix_rank(block, rtol=1e-6, hermitian=True))))
-        names = tuple(f"c{k}" for k in range(columns.shape[1]))
-        term = Term(Unknown, (), names, columns, np.zeros(len(names)))
-        found.append(Structure(covariate, term, gain, z))
-    return sorted(found, key=lambda s: -s.z)
+        slack = np.zeros(columns.shape[1]) if covariate in UNFEIGNED else _slack(space, columns)
+        gain = float(value @ np.linalg.pinv(inverse + np.diag(slack), 1e-12, hermitian=True) @ value)
+        rank = int(np.linalg.matrix_rank(block, rtol=1e-6, hermitian=True))
+        z, plain = (float(equivalent_z(x, rank)) for x in (gain, float(value @ block @ value)))
+        yield Structure(covariate, _as_term(columns), gain, z, plain)
+
+
+def _as_term(columns: F64) -> Term:
+    names = tuple(f"c{k}" for k in range(columns.shape[1]))
+    return Term(Unknown, (), names, columns, np.zeros(len(names)))
 
 
 def _shapes(space: Space) -> Iterator[tuple[str, F64]]:
@@ -88,6 +117,8 @@ def _shapes(space: Space) -> Iterator[tuple[str, F64]]:
         yield "temperature_c", over(_bumps(c.temperature_c, 10))
     if c.time_s[-1] > 20.0:
         yield "time_s", over(_bumps(c.time_s, 16))
+    if c.other_rate_dps is not None and np.ptp(c.other_rate_dps) > 10.0:
+        yield "other_rate_dps", over(_bumps(c.other_rate_dps, 11))
     if np.any(np.diff(c.direction) != 0.0):
         yield "time_since_reversal_s", over(_since_reversal(c.direction, c.interval_s))
 

@@ -45,12 +45,19 @@ class NoiseFit:
 
 
 def fit_noise(
-    rows: Rows, y: F64, columns: F64, scale_factor: float, start: RowNoise, near: NoiseFit | None = None
+    rows: Rows,
+    y: F64,
+    columns: F64,
+    scale_factor: float,
+    start: RowNoise,
+    near: NoiseFit | None = None,
+    guess: RowNoise | None = None,
 ) -> NoiseFit:
     """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p).
 
     The error of the encoder's readings is estimated too where the rows bring no variance for it. ``near`` is a fit to
-    almost the same rows: the same kind of noise is fitted again, from there.
+    almost the same rows: the same kind of noise is fitted again, from there. Coloured noise is looked for about the
+    ``guess``, or widely.
     """
     n = len(rows)
     if n > MAX_ROWS:
@@ -89,10 +96,12 @@ def fit_noise(
         for share in (0.95, 0.8)
         for tau in (0.05, 0.3, 2.0)
     ]
-    guess = min(guesses, key=deviance)
-    if deviance(guess) > low + 2.0:
+    if guess is not None:
+        guesses = [np.log([guess.white, guess.ar1, guess.correlation_time_s])]
+    best = min(guesses, key=deviance)
+    if deviance(best) > low + 2.0:
         return plain
-    white, ar1, tau = np.exp(guess).tolist()
+    white, ar1, tau = np.exp(best).tolist()
     known = {"white": white, "reading_deg": base.reading_deg, "ar1": ar1, "correlation_time_s": tau}
     coloured = (*fields, "ar1", "correlation_time_s")
     better, lower = fitted(coloured, [known[field] for field in coloured])

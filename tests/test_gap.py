@@ -81,6 +81,14 @@ def test_an_effect_in_no_library_is_flagged_and_gets_no_name() -> None:
     assert answer["missing"] == []
 
 
+@pytest.mark.parametrize(("effect", "along"), [("cross_axis", "other_rate_dps"), ("temperature_kink", "temperature_c")])
+def test_what_has_no_name_does_not_pass_for_noise(effect: str, along: str) -> None:
+    pool = {name: suspect for name, suspect in library().items() if name != effect}
+    answer = to_json(diagnose(made(8, {effect: 2.0}, ar1_V=3e-4, phi=0.97), "x", suspects=pool))
+    assert answer["verdict"] == "unknown"
+    assert answer["unknown"]["covariate"] == along
+
+
 def test_two_effects_are_both_found() -> None:
     diagnosis = diagnose(made(9, {"bias_temperature": 1.0, "scale_factor_asymmetry": 1.0}), "x")
     assert {"bias_temperature", "scale_factor_asymmetry"} <= told(diagnosis)
