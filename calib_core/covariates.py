@@ -16,6 +16,8 @@ F64 = NDArray[np.float64]
 
 CROSSOVER_S = 0.15
 """Below this time scale the gyro leads, above it the encoder."""
+BACKGROUND_S = 5.0
+"""Below this time scale the gyro tells when the table turns."""
 TURNING_DPS = 1.5
 """Rates above this give a direction; slower ones keep the last."""
 COVARIATE_S = 0.5
@@ -40,7 +42,11 @@ def of(recording: Recording, axis: str, design: Design, bias: float, scale_facto
         position += _smooth(angle - position, slow)
         still = design.averages.at[design.averages.at >= 0]
         rate[still] = 0.0
-        turning = rate
+        # The encoder's own jump at a reversal, smoothed, would move the moment at which the table seems to turn.
+        slow = BACKGROUND_S / interval
+        turning = felt - _smooth(felt, slow) + np.gradient(_smooth(angle, slow), interval)
+        turning = np.convolve(np.pad(turning, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        turning[still] = 0.0
     else:
         reference = recording.reference_rate(axis)
         assert reference is not None
@@ -92,13 +98,26 @@ def encoder_rate(recording: Recording, axis: str, design: Design, smooth_s: floa
 
 
 def direction(rate_dps: F64) -> F64:
-    """(n,) sign of the last rotation faster than ``TURNING_DPS``; 0 before the first."""
+    """(n,) sign of the last rotation; 0 before the first that was faster than ``TURNING_DPS``.
+
+    It changes where the rate passed zero before it was that fast; the sample next to that moment has what a straight
+    line through its neighbours needs for the step to be there.
+    """
     sign = np.where(rate_dps > TURNING_DPS, 1.0, np.where(rate_dps < -TURNING_DPS, -1.0, 0.0))
     turned = np.flatnonzero(sign)
     if len(turned) == 0:
         return sign
     last = np.searchsorted(turned, np.arange(len(sign)), side="right") - 1
-    return np.where(last >= 0, sign[turned[np.maximum(last, 0)]], 0.0)
+    out = np.where(last >= 0, sign[turned[np.maximum(last, 0)]], 0.0)
+    index = np.arange(len(sign))
+    for now in (1.0, -1.0):
+        slower = np.maximum.accumulate(np.where(now * rate_dps <= 0.0, index, -1))
+        for k in np.flatnonzero((out[1:] == now) & (out[:-1] == -now)) + 1:
+            j = int(slower[k])
+            out[j + 1 : k] = now
+            share = -rate_dps[j] / (rate_dps[j + 1] - rate_dps[j]) if rate_dps[j] else 0.5
+            out[j if share < 0.5 else j + 1] += now * (1.0 - 2.0 * share)
+    return out
 
 
 def _angle(recording: Recording, axis: str, at_s: F64) -> F64:

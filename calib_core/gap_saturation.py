@@ -22,6 +22,10 @@ LEVEL = 4.0
 """Samples within this many deviations of the extreme level are on it."""
 LEAST = 15
 """So many samples make a level."""
+FEWEST = 100
+"""Samples through which the line is drawn."""
+SETTLED = 3.0
+"""So many deviations of the smoothing after a change."""
 SMOOTH_S, STEADY_DPS2, STEADY_S = 0.06, 150.0, 0.1
 """Where the rate changes faster, or the output moves within this time, the smoothed encoder is behind."""
 
@@ -48,7 +52,11 @@ def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip 
     wander = maximum_filter1d(s.output, width) - minimum_filter1d(s.output, width)
     steady = (np.abs(np.gradient(rate, s.interval_s)) < STEADY_DPS2) & (wander < 3.0 * LEVEL * noise)
     inner = steady & (np.abs(s.output - middle) < 0.7 * reach)
-    if reach < 20.0 * noise or inner.sum() < 100:
+    # Where motion begins and ends the smoothed encoder is slower than the gyro: by half a per cent over all.
+    settled = inner & minimum_filter1d(steady, 2 * round(SETTLED * SMOOTH_S / s.interval_s) + 1)
+    if settled.sum() >= FEWEST:
+        inner = settled
+    if reach < 20.0 * noise or inner.sum() < FEWEST:
         return None
     fit = np.polynomial.Polynomial.fit(rate[inner], s.output[inner], 1)
     expected = fit(rate)

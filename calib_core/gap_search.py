@@ -314,8 +314,8 @@ class Search:
 
         While the search goes on the noise is estimated beside the best of all classes, which makes it small.
         """
+        self.space.refit_noise(self.chosen)
         while len(self.chosen) > self.given:
-            self.space.refit_noise(self.chosen)
             both = self.chi2(self.chosen)
             weakest, least = self.given, np.inf
             for k in range(self.given, len(self.chosen)):
@@ -326,6 +326,7 @@ class Search:
             if least >= self.findings[weakest - self.given].threshold:
                 return
             del self.chosen[weakest], self.findings[weakest - self.given]
+            self.space.refit_noise(self.chosen)
 
     def merge(self) -> None:
         """Two effects that one other explains as well were that one: the truth may not look best at first."""

@@ -147,7 +147,7 @@ class Space:
 
     def refit_noise(self, terms: Iterable[Term], guess: RowNoise | None = None) -> None:
         """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew. Coloured noise
-        is looked for about the ``guess``, or widely.
+        is looked for about the ``guess`` too.
 
         The codes' error is a sawtooth, not white; overstated, it leaves nothing for AR(1) noise to pose as.
         """

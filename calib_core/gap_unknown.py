@@ -20,8 +20,8 @@ from calib_core.gap_space import FEIGNED_STEPS, LONG, TOGETHER, Space, Term
 
 F64 = NDArray[np.float64]
 
-CERTAIN = 3.5
-"""The |z| that a shape must reach: three healthy records in a thousand do, over all six covariates."""
+CERTAIN = 4.0
+"""The |z| that a shape must reach: one healthy record in thousands does, over all six covariates."""
 HARMONICS = range(3, 13)
 UNFEIGNED = ("temperature_c", "time_s", "other_rate_dps")
 """What goes on for many seconds, or with the other axis, the codes of this one do not feign."""
@@ -49,18 +49,20 @@ class Structure:
 
 def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
     """Every covariate's shape beside base and ``chosen``: what is certain first, and of that what explains most."""
-    bases: Iterable[tuple[str, F64]] = _bases(space)
     was = space.noise
-    if was.noise.ar1 > 0.0 and len(space.rows) <= LONG:
-        # What has no name yet is in no model, and poses as noise that is correlated over seconds.
-        bases = list(bases)
-        held = np.column_stack([space.base, *(t.columns for t in chosen)])
+    if was.noise.ar1 == 0.0 or len(space.rows) > LONG:
+        found = list(_tested(space, chosen, _bases(space)))
+    else:
+        # What has no name yet is in no model, and poses as noise that is correlated over seconds. What goes on for so
+        # long and follows nothing but time is that noise as likely as not.
+        bases = list(_bases(space))
         fast = [columns for name, columns in bases if name != "time_s"]
+        found = list(_tested(space, chosen, [base for base in bases if base[0] == "time_s"]))
         if fast:
+            held = np.column_stack([space.base, *(t.columns for t in chosen)])
             space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))], guess=was.noise)
-    found = list(_tested(space, chosen, bases))
-    if space.noise is not was:
-        space.use_noise(was)
+            found += _tested(space, chosen, [base for base in bases if base[0] != "time_s"])
+            space.use_noise(was)
     return sorted(found, key=lambda s: (s.z < CERTAIN, -s.plain))
 
 

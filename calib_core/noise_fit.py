@@ -16,6 +16,8 @@ MAX_ROWS = 24_000
 BLOCK = 3_000
 AR1_EVIDENCE = 8.0
 """2ΔlnL that the two parameters of AR(1) noise must buy."""
+GUESSES = [(0.95, 0.05), (0.95, 0.3), (0.95, 2.0), (0.8, 0.05), (0.8, 0.3), (0.8, 2.0), (0.99, 1.0), (0.995, 3.0)]
+"""White noise's share, and the correlation time of the rest: the slower, the less of it is plain to see."""
 ENOUGH = 0.02
 """A relative step in the noise that no longer matters."""
 MAX_CORRELATION_S = 5.0
@@ -57,7 +59,7 @@ def fit_noise(
 
     The error of the encoder's readings is estimated too where the rows bring no variance for it. ``near`` is a fit to
     almost the same rows: the same kind of noise is fitted again, from there. Coloured noise is looked for about the
-    ``guess``, or widely.
+    ``guess`` too.
     """
     n = len(rows)
     if n > MAX_ROWS:
@@ -91,13 +93,9 @@ def fit_noise(
     base = plain.noise
     trial = replace(plain, fields=("white", "ar1", "correlation_time_s"), base=base)
     deviance = deviance_of(trial)
-    guesses = [
-        np.log([share * base.white, math.sqrt(1.0 - share**2) * base.white, tau])
-        for share in (0.95, 0.8)
-        for tau in (0.05, 0.3, 2.0)
-    ]
+    guesses = [np.log([share * base.white, math.sqrt(1.0 - share**2) * base.white, tau]) for share, tau in GUESSES]
     if guess is not None:
-        guesses = [np.log([guess.white, guess.ar1, guess.correlation_time_s])]
+        guesses = [np.log([guess.white, guess.ar1, guess.correlation_time_s]), *guesses[3:]]
     best = min(guesses, key=deviance)
     if deviance(best) > low + 2.0:
         return plain
