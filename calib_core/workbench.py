@@ -18,8 +18,10 @@ from calib_core import gap, gap_saturation, gap_spectrum
 from calib_core.effects import Acts, Effect, library
 from calib_core.gap_search import equivalent_z
 from calib_core.gap_space import Space
+from calib_core.noise_fit import NoiseFit
 from calib_core.problem import Problem
 from calib_core.recording import Recording
+from calib_core.whitening import RowNoise
 from calib_core.workspace import Fitted, Workspace
 
 F64 = NDArray[np.float64]
@@ -88,6 +90,7 @@ class Workbench:
     axis: str
     _models: dict[tuple[str, ...], Model] = field(default_factory=dict)
     _own: dict[str, type[Effect]] = field(default_factory=dict)
+    _noise: RowNoise | None = None
 
     @cached_property
     def _parts(self) -> tuple[Workspace, Workspace | None, gap_saturation.Clip | None]:
@@ -123,6 +126,15 @@ class Workbench:
     def effects(self) -> tuple[str, ...]:
         """Those that a model of this recording can have."""
         return (*self._whole.effects, *BY_THEMSELVES)
+
+    def settle(self, noise: NoiseFit) -> None:
+        """Judges by this noise from now on: a search knows it beside all that it found, named or not."""
+        if noise.noise == self._noise:
+            return
+        for workspace in filter(None, self._parts[:2]):
+            workspace.space.use_noise(noise)
+        self._noise = noise.noise
+        self._models.clear()
 
     def own(self, effect: type[Effect]) -> None:
         """A user's own effect; models with another of the same name are forgotten."""

@@ -8,7 +8,7 @@ import asyncio
 import itertools
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -22,7 +22,7 @@ LONG = 60_000
 """Samples from which a search is long; that of a session of 45 minutes takes 0.8 GB while it lasts."""
 KEPT = 64
 """So many verdicts are kept: the next student who opens an example need not wait."""
-Key = tuple[Hashable, ...]
+Key = tuple[object, ...]
 
 
 @dataclass
@@ -47,9 +47,8 @@ class Searches:
 
         With ``keep`` the answer is there for those who ask later: it must depend on the key alone.
         """
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            kept: T = self._kept[key]
+        kept: T | None = self.known(key)
+        if kept is not None:
             return kept
         if key not in self._jobs:
             job = self._jobs[key] = Job(next(self._slots), time.monotonic())
@@ -63,6 +62,12 @@ class Searches:
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
         return answer
+
+    def known(self, key: Key) -> Any:
+        """The answer that is kept; None where there is none."""
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        return self._kept.get(key)
 
     async def _do(self, key: Key, job: Job, samples: int, work: Callable[..., T], *arguments: object) -> T:
         try:

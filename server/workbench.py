@@ -19,6 +19,7 @@ from server.live import encode
 from server.texts import render, texts
 
 if TYPE_CHECKING:
+    from calib_core.noise_fit import NoiseFit
     from calib_core.points import Points
     from calib_core.workbench import Model, Workbench
 
@@ -85,8 +86,9 @@ def fit(
     points: int,
     board: str,
     lang: str,
+    noise: NoiseFit | None = None,
 ) -> bytes:
-    """Base and effects on a recording, with everything that a page draws of it."""
+    """Base and effects on a recording, with everything that a page draws of it; ``noise``: what a search found."""
     from calib_core import formula
     from calib_core.pictures import decimated, spectrum, stretches
 
@@ -94,6 +96,8 @@ def fit(
     if readings is not None:
         return workbench_points.fit(readings, axis, board, effects, formulas, lang)
     bench = warm(data, recording, axis)
+    if noise is not None:
+        bench.settle(noise)
     for own in formulas:
         bench.own(formula.from_json(own))
     model = bench.fit(effects)
@@ -115,21 +119,21 @@ def fit(
         order = np.argsort(values, kind="stable")
         arrays |= {f"{name}/at": values[order], f"{name}/residual": fitted.residual_dps[order]}
         arrays |= {f"{name}/middle": middle, f"{name}/mean": mean, f"{name}/sigma": sigma}
-    noise = fitted.explanation.space.noise.noise
+    white = fitted.explanation.space.noise.noise.white
     head = {
         "axis": axis, "unit": samples.unit, "effects": list(model.effects), "samples": len(time),
         "whole": len(at) == inside.stop - inside.start, "error": _error(model), "possible": bench.effects,
         "steps": [_error(bench.fit(model.effects[:k]))["held_out"] for k in range(len(model.effects) + 1)],
         "parameters": model.parameters, "failures": _failures(model, lang),
         "along": [diagnosis.placed(n) for n in along],
-        "white_density": noise.white / scale * float(np.sqrt(2.0 * samples.interval_s)),
+        "white_density": white / scale * float(np.sqrt(2.0 * samples.interval_s)),
     }  # fmt: skip
     return encode(diagnosis.plain(head), arrays)
 
 
 def searched(data: Path, recording: str, axis: str) -> Words:
-    """What a search of the library says of the base: the diagnosis, the |z| that noise alone reaches, and the effects
-    that a model of this recording can have."""
+    """What a search of the library says of the base: the diagnosis, the |z| that noise alone reaches, the effects that
+    a model of this recording can have, and the noise (NoiseFit; None where nothing could be tested)."""
     from calib_core.gap import diagnose
     from calib_core.gap_report import to_json
     from calib_core.workbench import BY_THEMSELVES
@@ -139,8 +143,9 @@ def searched(data: Path, recording: str, axis: str) -> Words:
         loaded = store.recording(recording)
     found = diagnose(loaded, diagnosis.axis_of(loaded, axis), told=tell)
     possible = (*found.search.suspects, *BY_THEMSELVES) if found.search else ()
-    threshold = found.search.threshold if found.search else float("inf")
-    return {"diagnosis": diagnosis.explained(to_json(found)), "threshold": threshold, "possible": possible}
+    threshold, noise = (found.search.threshold, found.search.space.noise) if found.search else (float("inf"), None)
+    answer = diagnosis.explained(to_json(found))
+    return {"diagnosis": answer, "threshold": threshold, "possible": possible, "noise": noise}
 
 
 def suspects(

@@ -93,7 +93,7 @@ def test_a_dropped_recording_is_opened_and_a_fit_that_leaves_nothing_says_what_i
 ) -> None:
     page = window.open("/workbench.html")
     drop(page, "sine.csv", healthy)
-    page.wait_for_selector(".says .limits:has-text('could not test')", timeout=60_000)
+    page.wait_for_selector(".says .limits:has-text('It could not test')", timeout=60_000)
     assert "leaves nothing but noise" in window.text(".says")
     assert "nothing turned faster than 4" in window.text(".says")
     assert "could not test" in window.text(".verdict")
@@ -114,6 +114,25 @@ def test_a_bad_file_is_refused_where_it_was_dropped_and_a_better_one_still_goes(
     assert page.is_enabled("#file")
     drop(page, "nothing.csv", b"not a recording")
     page.wait_for_selector(".error:not(:has-text('Line 6'))")
+    window.close(refusals=2)
+
+
+@pytest.mark.parametrize(
+    ("column", "says"), [("x_gyro_v", "no reference"), ("x_gyro_v,x_position_deg", "Record longer")]
+)
+def test_what_cannot_be_tested_says_so_in_place_of_an_answer(
+    browser: Any, server: Server, column: str, says: str
+) -> None:
+    """Four seconds of noise at rest, without and with an encoder: there is nothing to fit, or not enough to know it."""
+    window = Window(browser, server)
+    page = window.open("/workbench.html")
+    rows = [f"{i / 100:.2f},{1.25 + 0.001 * (i * 7919 % 13):.4f},0.0" for i in range(400)]
+    names = len(column.split(",")) + 1
+    drop(page, "rest.csv", csv_bytes([f"time_s,{column}", *(",".join(row.split(",")[:names]) for row in rows)]))
+    page.wait_for_selector(f".says:has-text('{says}')", timeout=30_000)
+    assert page.locator(".traces .u-wrap").first.is_visible()
+    for place in (".beside", ".suspects", "#propose", "#model-name", "text=Fitting"):
+        assert not page.locator(place).first.is_visible(), place
     window.close(refusals=2)
 
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from calib_core.points import FORMAT
 from server import compute, examples, workbench
-from server.api.common import Here, Language
+from server.api.common import Here, Language, Services
 from server.api.models import Answer, Body, Plain
 from server.problems import declared
 from server.texts import render
@@ -109,6 +109,11 @@ def signal(
     return Response(workbench.signal(here.store.data, recording, axis, board, points), media_type=COLUMNS)
 
 
+def _asked(here: Services, recording: str, axis: str) -> tuple[object, ...]:
+    """What a search of the library is known by; a run that is still on has more samples each time."""
+    return (recording, axis, "suspects", here.store.recordings.row(recording)["samples"])
+
+
 @router.post(
     "/recordings/{recording}/fit",
     summary="Base and effects on a recording: signal, residuals, spectrum, parameters, error on data not seen",
@@ -116,7 +121,7 @@ def signal(
     response_class=Response,
 )
 async def fit(recording: str, body: FitBody, here: Here, lang: Language) -> Response:
-    here.store.recordings.row(recording)
+    found = here.searches.known(_asked(here, recording, body.axis))
     formulas = [formula.model_dump() for formula in body.formulas]
     window = (body.begin_s, body.end_s)
     columns = await here.compute.run(
@@ -130,6 +135,7 @@ async def fit(recording: str, body: FitBody, here: Here, lang: Language) -> Resp
         body.points,
         body.board,
         lang,
+        found and found["noise"],
     )
     return Response(columns, media_type=COLUMNS)
 
@@ -150,8 +156,7 @@ async def suspects(
     row = here.store.recordings.row(recording)
     names, found = tuple(filter(None, effects.split(","))), None
     if row["header"].get("format") != FORMAT:
-        asked = (recording, axis, "suspects", row["samples"])
-        given = (here.store.data, recording, axis)
+        asked, given = _asked(here, recording, axis), (here.store.data, recording, axis)
         found = await here.searches.run(asked, row["samples"], workbench.searched, *given, keep=True)
     answer = await here.compute.run(workbench.suspects, here.store.data, recording, axis, names, board, lang, found)
     return Suspects.model_validate(answer)

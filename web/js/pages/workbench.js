@@ -103,8 +103,16 @@ async function open(main, recording, row, signal) {
       else refresh();
     } catch (problem) {
       if (before && problem.code?.startsWith("formula.")) throw problem;
-      say(error, problem);
+      if (before) say(error, problem);
+      else fail(problem.message);
     } finally { busy = false; }
+  }
+
+  /** Nothing can be said of this recording: one sentence says why, where the answer would stand; what needs a fit is gone. */
+  function fail(why) {
+    judged++;
+    draw.fail(why);
+    for (const place of [side.parentElement, main.querySelector(".evidence-row"), nextPlace, keepPlace]) place.hidden = true;
   }
 
   /** What the library says beside the model; a long search holds nothing up, and the last question counts. */
@@ -114,10 +122,20 @@ async function open(main, recording, row, signal) {
     try {
       const said = await api.suspects(recording, { axis, board, effects });
       if (mine !== judged) return;
-      if (!answer && !effects.length && !isGuessing.checked) book.write({ step: "verdict", code: said.code, values: said.values });
+      const isFirst = !answer;
+      if (isFirst && !effects.length && !isGuessing.checked && said.verdict !== "not_testable") book.write({ step: "verdict", code: said.code, values: said.values });
       answer = said;
       refresh();
+      // A search knows the noise better than the first fit did: what is shown is to say the same as the verdict.
+      if (isFirst && at >= 0 && mine === judged && !signal.points) await again();
     } catch (problem) { if (mine === judged) say(error, problem); }
+  }
+
+  /** The models tried so far, fitted anew. */
+  async function again() {
+    const models = await Promise.all(history.map(({ effects }) => fit(effects)));
+    history.splice(0, models.length, ...models);
+    drawModel();
   }
 
   function drawModel(ms) {
@@ -137,10 +155,12 @@ async function open(main, recording, row, signal) {
       if (!isGuessing.checked) showByHand(byHand, cards, history[at], { open: show, toggle });
       return;
     }
+    if (answer.verdict === "not_testable") { fail(answer.sentence); return; }
     draw.limits(answer.untested);
     next.label(answer);
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
+    nextPlace.hidden = hidden || Boolean(signal.points);  // what it would tell apart tells what is suspected
     if (hidden) {
       cardPlace.replaceChildren(h("p", { class: "muted" }, t("workbench.guess.read")));
       verdict.textContent = t("workbench.guess.hidden");

@@ -92,6 +92,12 @@ export function pictures(place, { unit, points, detail, pointed }) {
     return largest > base / STEADY ? base : largest;
   }
 
+  function headline(failures) {
+    sentence.replaceChildren(isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits"));
+    // A fit that leaves nothing is read as "nothing is there": how far it holds belongs to it.
+    if (!isHiding && !failures.length) sentence.append(" ", h("span", { class: "limits" }, untested ?? t("workbench.untested_waiting")));
+  }
+
   /** Everything of the model that is shown; in guessing without a word of where it fails. */
   function draw() {
     const { columns: c, along } = shown;
@@ -102,9 +108,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
       shade: failures.slice(0, 1).filter((f) => f.covariate === "time_s").map((f) => [f.from, f.to]),
     });
     residual.rename(compared ? t("workbench.residual_two") : t(points ? "workbench.residual_points" : "workbench.residual"), t("chart.residual"));
-    sentence.replaceChildren(isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits"));
-    // A fit that leaves nothing is read as "nothing is there": how far it holds belongs to it.
-    if (!isHiding && !failures.length) sentence.append(" ", h("span", { class: "limits" }, untested ?? t("workbench.untested_waiting")));
+    headline(failures);
     for (const one of along) {
       if (!multiples.has(one.covariate)) multiples.set(one.covariate, multiple(one));
       const { plot, says, figure } = multiples.get(one.covariate);
@@ -136,9 +140,13 @@ export function pictures(place, { unit, points, detail, pointed }) {
     },
     /** What the recording could not test, in words. */
     limits(text) {
-      if (untested === text) return;
       untested = text;
-      if (shown) draw();
+      if (shown) headline(isHiding ? [] : shown.failures);
+    },
+    /** Nothing can be said of it, and why: the signal stays, the places of what would be left of it go. */
+    fail(text) {
+      sentence.replaceChildren(text);
+      for (const node of [...traces.children].slice(1).concat([...place.children].slice(2))) node.hidden = true;
     },
     /** In guessing, each picture can be pointed at. */
     pointing(on, covariate = null) {
