@@ -84,7 +84,7 @@ def test_an_effect_in_no_library_is_flagged_and_gets_no_name() -> None:
 @pytest.mark.parametrize(("effect", "along"), [("cross_axis", "other_rate_dps"), ("temperature_kink", "temperature_c")])
 def test_what_has_no_name_does_not_pass_for_noise(effect: str, along: str) -> None:
     pool = {name: suspect for name, suspect in library().items() if name != effect}
-    answer = to_json(diagnose(made(8, {effect: 2.0}, ar1_V=3e-4, phi=0.97), "x", suspects=pool))
+    answer = to_json(diagnose(made(8, {effect: 3.0}, ar1_V=3e-4, phi=0.97), "x", suspects=pool))
     assert answer["verdict"] == "unknown"
     assert answer["unknown"]["covariate"] == along
 
