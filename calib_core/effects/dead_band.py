@@ -17,7 +17,7 @@ class DeadBand(Effect):
     """
 
     name, stage, acts = "dead_band", Stage.SENSOR, Acts.RATE
-    d = Param("deg/s", 2.0, (0.05, 20.0), grid=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0), log=True)
+    d = Param("deg/s", 2.0, (0.005, 20.0), grid=(0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0), log=True)
 
     @classmethod
     def columns(cls, c: Covariates, **nonlinear: float) -> dict[str, F64]:
