@@ -20,6 +20,7 @@ from calib_core.gap_error import Explanation
 from calib_core.gap_search import SHARE, Search, Suspicion
 from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
+from calib_core.gap_spikes import spikes
 from calib_core.gap_unknown import CERTAIN, Structure, structures
 from calib_core.gap_wander import Walk, wandering
 from calib_core.integral_fit import Design
@@ -138,7 +139,12 @@ def named(search: Search) -> list[Term]:
 
 
 def prepare(recording: Recording, axis: str, mask: NDArray[np.bool_] | None = None) -> Space:
-    """The space of the rows in ``mask`` (of the recording), about its base."""
+    """The space of the rows in ``mask`` (of the recording) that are no spikes, about its base."""
+    output = recording.gyro(axis).values
+    known = np.flatnonzero(np.isfinite(output))
+    if len(out := spikes(output[known])):
+        mask = np.ones(len(recording), bool) if mask is None else mask.copy()
+        mask[known[out]] = False
     design = Design.of(recording, axis, mask)
     rough = design.rough()
     scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib_core.encoder_noise import step_of
 from calib_core.gap_blocks import Blocks
+from calib_core.gap_spikes import spikes
 from calib_core.integral_fit import MOVED_STEPS
 from calib_core.recording import Recording
 from calib_core.rows import GAP
@@ -78,7 +79,7 @@ def checks(recording: Recording, axis: str) -> list[Check]:
     look = _Look(recording, axis, index, output[index])
     out += [*_covariates(recording, index), look.motion()]
     if look.kind:
-        out += [look.converter(), *look.encoder(), *look.levels(), *look.answer()]
+        out += [look.converter(), *look.encoder(), *look.spikes(), *look.levels(), *look.answer()]
     return out
 
 
@@ -201,6 +202,12 @@ class _Look:
         if self.encoder_step > COARSE_ENCODER_DEG:
             return [_bad("encoder_step", "encoder_coarse", False, **told)]
         return [_good("encoder_step", "" if self.encoder_step else "encoder_step_none", **told)]
+
+    def spikes(self) -> list[Check]:
+        """Single samples far out of line, which the diagnosis leaves out; nothing is said where there are none."""
+        at = spikes(self.output)
+        told = {"axis": self.axis, "count": len(at)}
+        return [_bad("spikes", "spikes", False, at_s=float(self.time[at[0]]), **told)] if len(at) else []
 
     def levels(self) -> list[Check]:
         """Stretches in which the output stays on one value: a limit at the ends of its range, else a stuck channel."""

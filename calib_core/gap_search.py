@@ -84,7 +84,11 @@ class Search:
         self.given = len(self.chosen)
 
     def terms(self) -> list[Term]:
-        """Every suspect not yet chosen, at every point of its grid."""
+        """Every suspect not yet chosen, at every point of its grid.
+
+        A rate that was measured went through a filter of its own, as late or early as the gyro's: beside it one late
+        answer can be told, and what a second one would mend is that filter's form.
+        """
         fresh = [name for name in self.suspects if name not in self.columns]
         for name in fresh:
             effect = self.suspects[name]
@@ -92,6 +96,8 @@ class Search:
         if fresh:
             self.space.enlist([t for terms in self.columns.values() for t in terms])
         taken = {t.name for t in self.chosen}
+        if self.space.design.reference == "rate" and any(t.effect.curvature is not None for t in self.chosen):
+            taken |= {name for name, effect in self.suspects.items() if effect.curvature is not None}
         return [t for name in self.suspects if name not in taken for t in self.columns[name]]
 
     def scan(self) -> tuple[Gram, list[Suspicion]]:

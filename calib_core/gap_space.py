@@ -153,7 +153,8 @@ class Space:
         """
         columns = np.column_stack([self.base, *(t.columns for t in terms)])
         rows = replace(self.rows, reading_variance=OVERSTATED * self.rows.reading_variance)
-        noise = fit_noise(rows, self.residual, columns, self.scale_factor, RowNoise(self.rough_noise), None, guess)
+        start, longest = RowNoise(self.rough_noise), self.design.longest_noise_s
+        noise = fit_noise(rows, self.residual, columns, self.scale_factor, start, None, guess, longest_s=longest)
         least = math.log(self._least_noise)
         if noise.logarithms[0] < least:
             # Without rests the encoder's error hides the gyro's noise, but not from the output's own scatter.

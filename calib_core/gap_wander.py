@@ -18,7 +18,6 @@ from calib_core.effects.base import Acts
 from calib_core.gap_search import RIVAL, TUNED, Search
 from calib_core.gap_space import Space, Term
 from calib_core.gap_unknown import Unknown
-from calib_core.noise_fit import MAX_CORRELATION_S
 
 F64 = NDArray[np.float64]
 
@@ -55,7 +54,7 @@ def wandering(search: Search) -> Walk | None:
     kept = [t for k, t in enumerate(search.chosen) if k < given or t.name not in SLOW]
     slow = tuple(t.name for t in search.chosen[given:] if t.name in SLOW)
     noise = space.noise.noise
-    at_limit = noise.ar1 > 0.0 and noise.correlation_time_s > NEAR_LIMIT * MAX_CORRELATION_S
+    at_limit = noise.ar1 > 0.0 and noise.correlation_time_s > NEAR_LIMIT * space.noise.longest_s
     if len(kept) == len(search.chosen) and not at_limit:
         return None
     was, now = space.noise, search.deviance(search.chosen)
@@ -67,7 +66,7 @@ def wandering(search: Search) -> Walk | None:
     deviance = np.array([_deviance(search, kept, waves, math.exp(u) * deviations) for u in size])
     best = int(np.argmin(deviance))
     # Noise that would be slower if it could speaks for the walk itself.
-    margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * MAX_CORRELATION_S else RIVAL
+    margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * space.noise.longest_s else RIVAL
     # Of what strong slow shapes explain, a share is always their form, which a walk mends without being one.
     margin += FORM * max(plain - now - STRONG, 0.0)
     gain = now - float(deviance[best]) - margin

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib_core.code_likelihood import Sites, path_variance, sharpen
 from calib_core.encoder_noise import Readings
-from calib_core.noise_fit import MAX_CORRELATION_S, NoiseFit, first_guess, fit_noise
+from calib_core.noise_fit import NoiseFit, first_guess, fit_noise, longest_correlation_s
 from calib_core.recording import Recording
 from calib_core.rows import Averages, samples, with_encoder, with_reference
 from calib_core.uncertainty import Contribution, coverage_factor
@@ -179,9 +179,16 @@ class Design:
         """The noise about the columns; the scale factor of an encoder is kept, for a free one would trade the codes'
         error, which it multiplies, for noise."""
         if self.readings is None or len(values) == 1:
-            return fit_noise(self.rows, y, columns, 0.0, start, near)
-        others = np.delete(columns, 1, axis=1)
-        return fit_noise(self.rows, y - columns[:, 1] * values[1], others, float(values[1]), start, near)
+            return fit_noise(self.rows, y, columns, 0.0, start, near, longest_s=self.longest_noise_s)
+        others, scale_factor = np.delete(columns, 1, axis=1), float(values[1])
+        rest = y - columns[:, 1] * scale_factor
+        return fit_noise(self.rows, rest, others, scale_factor, start, near, longest_s=self.longest_noise_s)
+
+    @property
+    def longest_noise_s(self) -> float:
+        """The longest correlation that noise of this record may have."""
+        s = self.averages.samples
+        return longest_correlation_s(s.interval_s, float(s.time_s[-1] - s.time_s[0]))
 
     def rough(self) -> F64:
         """Parameters (p,) from the integrals by plain least squares, to start from."""
@@ -315,8 +322,8 @@ def _report(design: Design, solution: Solution) -> Fit:
     elif design.reference == "encoder":
         warnings.append({"code": "fit.nothing_moved", "values": {}})
     p, noise = len(names), solution.noise.noise
-    if noise.ar1 > 0.0 and noise.correlation_time_s >= MAX_CORRELATION_S:
-        warnings.append({"code": "fit.wandering_bias", "values": {"correlation_time_s": MAX_CORRELATION_S}})
+    if noise.ar1 > 0.0 and noise.correlation_time_s >= solution.noise.longest_s:
+        warnings.append({"code": "fit.wandering_bias", "values": {"correlation_time_s": noise.correlation_time_s}})
     softness = solution.sites.softness if solution.sites else 0.0
     columns = design.columns(solution.delay_s, solution.values)
     chi2 = design.chi2(solution.y, columns, noise, solution.values, softness)

@@ -21,7 +21,10 @@ GUESSES = [(0.95, 0.05), (0.95, 0.3), (0.95, 2.0), (0.8, 0.05), (0.8, 0.3), (0.8
 ENOUGH = 0.02
 """A relative step in the noise that no longer matters."""
 MAX_CORRELATION_S = 5.0
-"""φ = 0.998 at 100 Hz; slower than this is not noise but a wandering bias."""
+"""Of noise; slower than this is a wandering bias."""
+MAX_SAMPLES, MOST_OF_RECORD = 500.0, 0.1
+"""φ = 0.998 from sample to sample, which is that at 100 Hz. Where samples come more rarely what wanders cannot be told
+from noise any sooner; but of a longer correlation than a tenth of the record there are too few to know it by."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +37,23 @@ class NoiseFit:
     """(k,) ln of those fields."""
     covariance: F64
     """(k, k) of the logarithms."""
+    longest_s: float = MAX_CORRELATION_S
+    """The correlation time is at most this."""
 
     def at(self, logarithms: F64) -> RowNoise:
         """The noise at other values of the logarithms (k,)."""
         values = np.exp(np.clip(logarithms, -60.0, 60.0)).tolist()
         noise = replace(self.base, **dict(zip(self.fields, values, strict=True)))
-        return replace(noise, correlation_time_s=min(max(noise.correlation_time_s, 1e-3), MAX_CORRELATION_S))
+        return replace(noise, correlation_time_s=min(max(noise.correlation_time_s, 1e-3), self.longest_s))
 
     @property
     def noise(self) -> RowNoise:
         return self.at(self.logarithms)
+
+
+def longest_correlation_s(interval_s: float, duration_s: float) -> float:
+    """How slow noise may be in a record of this length with samples at this interval."""
+    return max(MAX_CORRELATION_S, min(MAX_SAMPLES * interval_s, MOST_OF_RECORD * duration_s))
 
 
 def fit_noise(
@@ -54,8 +64,11 @@ def fit_noise(
     start: RowNoise,
     near: NoiseFit | None = None,
     guess: RowNoise | None = None,
+    *,
+    longest_s: float = MAX_CORRELATION_S,
 ) -> NoiseFit:
-    """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p).
+    """White and, where the record shows it, AR(1) noise of ``y`` (n,) about the span of ``columns`` (n, p), its
+    correlation time at most ``longest_s``.
 
     The error of the encoder's readings is estimated too where the rows bring no variance for it. ``near`` is a fit to
     almost the same rows: the same kind of noise is fitted again, from there. Coloured noise is looked for about the
@@ -80,7 +93,7 @@ def fit_noise(
         return deviance
 
     def fitted(fields: tuple[str, ...], values: list[float]) -> tuple[NoiseFit, float]:
-        fit = NoiseFit(start, fields, np.log(values), np.empty((0, 0)))
+        fit = NoiseFit(start, fields, np.log(values), np.empty((0, 0)), longest_s)
         logarithms, deviance, curvature = _minimise(deviance_of(fit), fit.logarithms)
         return replace(fit, logarithms=logarithms, covariance=_covariance(curvature)), deviance
 
@@ -93,7 +106,10 @@ def fit_noise(
     base = plain.noise
     trial = replace(plain, fields=("white", "ar1", "correlation_time_s"), base=base)
     deviance = deviance_of(trial)
-    guesses = [np.log([share * base.white, math.sqrt(1.0 - share**2) * base.white, tau]) for share, tau in GUESSES]
+    slow = [(0.8, 0.3 * longest_s)] if longest_s > MAX_CORRELATION_S else []
+    guesses = [
+        np.log([share * base.white, math.sqrt(1.0 - share**2) * base.white, tau]) for share, tau in (*GUESSES, *slow)
+    ]
     if guess is not None:
         guesses = [np.log([guess.white, guess.ar1, guess.correlation_time_s]), *guesses[3:]]
     best = min(guesses, key=deviance)

@@ -147,3 +147,11 @@ def test_both_languages_tell_of_it_and_it_has_a_drawing(effect: type[Effect]) ->
     assert [part for part, text in thai.items() if not text] == []
     drawing = ROOT / "web" / "effects" / f"{effect.name}.svg"
     assert ET.parse(drawing).getroot().tag.endswith("svg")
+
+
+def test_a_part_that_begins_hot_and_cools_is_not_warming_up() -> None:
+    c = covariates()
+    c.temperature_c = 30.0 + 5.0 * np.exp(-c.time_s / 60.0)
+    assert not library()["warm_up"].missing(c)
+    c.temperature_c = 50.0 - 25.0 * c.time_s / c.time_s[-1]
+    assert library()["warm_up"].missing(c)

@@ -35,20 +35,24 @@ def run(*, quick: bool) -> Iterator[Row]:
     if not FOLDER.is_dir():
         yield Row("real recordings", float("nan"), "", ours="../shared/real is not here")
         return
-    thermal = _read("thermal_chamber")
+    thermal = read_named("thermal_chamber")
     early = thermal.time_s <= TURNED_S
     for axis, (_, best) in list(THERMAL.items())[: 1 if quick else None]:
-        yield from _rows(f"thermal_chamber {axis}, last leg", axis, thermal.take(early), thermal, ~early, best)
+        name = f"thermal_chamber {axis}, last leg"
+        yield from _rows(name, axis, thermal.take(early), thermal, ~early, best)
+        told = ", ".join(f"{terms} {left:.3f}" for terms, left in least_squares(thermal, axis, early).items())
+        yield Row(f"{name}: METHOD's models", float("nan"), "deg/s", ours=f"plain least squares: {told}")
     if quick:
         return
-    one, other = _read("fast_rotation_A"), _read("fast_rotation_B")
+    one, other = read_named("fast_rotation_A"), read_named("fast_rotation_B")
     for axis, (_, best) in FAST.items():
         found = yield from _rows(f"fast_rotation {axis}, A → B", axis, one, other, np.ones(len(other), bool), best)
         trapped = found.isdisjoint({"time_offset", "bandwidth_lag"})
         yield Row(f"fast_rotation {axis}: the delay is missed", float(trapped), "1", 0.0)
 
 
-def _read(name: str) -> Recording:
+def read_named(name: str) -> Recording:
+    """A recording of ``../shared/real``."""
     with (FOLDER / f"{name}.csv").open("rb") as opened:
         return read(opened, name=name)
 
@@ -65,6 +69,36 @@ def _rows(name: str, axis: str, seen: Recording, whole: Recording, unseen: Any, 
     told = f"{said.verdict}: {', '.join(names) or 'nothing'}; base {plain:.3g}, single samples {single:.3g} deg/s"
     yield Row(name, after, "deg/s", best, ours=told)
     return set(names)
+
+
+def least_squares(whole: Recording, axis: str, seen: NDArray[np.bool_]) -> dict[str, float]:
+    """RMS in deg/s on what is not ``seen`` of METHOD 4's models, fitted by plain least squares: split and statistic are
+    METHOD's where these are its figures."""
+    time, output = whole.time_s / whole.time_s[-1], whole.gyro(axis).values
+    warm = (whole.columns["temperature_c"] - 20.0) / 50.0
+    powers = [warm, warm**2, warm**3]
+
+    def fitted(columns: list[F64]) -> tuple[float, float]:
+        both = np.column_stack([np.ones(len(time)), *columns])
+        left = output - both @ np.linalg.lstsq(both[seen], output[seen], rcond=None)[0]
+        return float(np.sqrt(np.mean(left[seen] ** 2))), float(np.sqrt(np.mean(left[~seen] ** 2)))
+
+    lags = [_lagged(whole.time_s, warm, tau) for tau in np.geomspace(10.0, 1000.0, 61)]
+    models: dict[str, list[list[F64]]] = {
+        "base": [[]],
+        "T³": [powers],
+        "T³ + t": [[*powers, time]],
+        "T³ + lag": [[*powers, lag] for lag in lags],
+        "T³ + lag + t": [[*powers, lag, time] for lag in lags],
+    }
+    return {name: min(map(fitted, settings))[1] for name, settings in models.items()}
+
+
+def _lagged(time_s: F64, values: F64, tau_s: float) -> F64:
+    from scipy.signal import lfilter
+
+    kept = float(np.exp(-np.median(np.diff(time_s)) / tau_s))
+    return np.asarray(lfilter([1.0 - kept], [1.0, -kept], values, zi=[kept * values[0]])[0])
 
 
 def error(said: Diagnosis, explanation: Any, whole: Recording, axis: str, unseen: Any, row_s: float = ROW_S) -> float:
