@@ -17,7 +17,7 @@ SUBJECTS: dict[str, tuple[str, ...]] = {
     "live": ("live",),
     "coverage": ("coverage",),
     "workbench": ("workbench",),
-    "gap": ("gap", "gap_real", "gap_cost", "gap_peers"),
+    "gap": ("gap", "gap_experiment", "gap_real", "gap_cost", "gap_peers"),
 }
 
 

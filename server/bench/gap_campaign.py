@@ -5,17 +5,21 @@ Every case is named by its group and number, from which its seed follows: a case
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import calib_core
 from calib_core.recording import Recording
 from server.bench.gap_oracle import detectable, evidence
 from server.bench.gap_records import EFFECTS, OUTSIDE_THE_LIBRARY, Record, record
@@ -105,6 +109,10 @@ class Outcome:
         return self.verdict == "missing"
 
     @property
+    def flagged_or_kin(self) -> bool:
+        return self.verdict == "unknown" or self.family
+
+    @property
     def family(self) -> bool:
         """Some effect is named that passes for the truth."""
         return any(truth in kin and kin & {*self.named, *self.tied} for truth in self.truth for kin in FAMILIES)
@@ -143,6 +151,39 @@ def play(case: Case) -> Outcome:
     )
 
 
+@cache
+def code() -> str:
+    """A digest of the arithmetic: outcomes of another are no outcomes of this."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(calib_core.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def keep(file: Path, outcome: Outcome) -> None:
+    """Writes one line more to ``file``."""
+    told = {
+        "code": code(), "case": str(outcome.case), "seed": outcome.case.seed, "verdict": outcome.verdict,
+        "named": outcome.named, "tied": sorted(outcome.tied), "unknown": outcome.unknown,
+        "held_out": outcome.held_out, "floor": outcome.floor, "cpu_s": outcome.cpu_s,
+    }  # fmt: skip
+    with file.open("a", encoding="utf-8") as opened:
+        opened.write(json.dumps(told) + "\n")
+
+
+def outcomes_in(file: Path, cases: Sequence[Case]) -> dict[str, Outcome]:
+    """What ``file`` has of these cases from this code, by the case's name."""
+    known, found = {str(case): case for case in cases}, {}
+    for line in file.read_text(encoding="utf-8").splitlines():
+        told = json.loads(line)
+        if told["code"] == code() and told["case"] in known:
+            found[told["case"]] = Outcome(
+                known[told["case"]], told["verdict"], tuple(told["named"]), frozenset(told["tied"]), told["unknown"],
+                told["held_out"], told["floor"], told["cpu_s"],
+            )  # fmt: skip
+    return found
+
+
 def true_floor(made: Record) -> float:
     """RMS of what noise and rounding leave in one-second windows (METHOD 2's weak form), in deg/s."""
     from calib_core.weak_form import Windows
@@ -156,15 +197,15 @@ def true_floor(made: Record) -> float:
 
 
 @contextmanager
-def player(processes: int = PROCESSES) -> Iterator[Callable[[Sequence[Case]], list[Outcome]]]:
-    """A function that plays many cases, in this process or over so many of its own."""
+def player(processes: int = PROCESSES) -> Iterator[Callable[[Sequence[Case]], Iterator[Outcome]]]:
+    """A function that plays many cases, in this process or over so many of its own, and gives each as it is done."""
     if processes < 2:
-        yield lambda cases: [play(case) for case in cases]
+        yield lambda cases: map(play, cases)
         return
     import multiprocessing
 
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        yield lambda cases: list(pool.imap_unordered(play, cases, chunksize=1))
+        yield lambda cases: pool.imap_unordered(play, cases, chunksize=1)
 
 
 # --- the groups --------------------------------------------------------------------------------------------------

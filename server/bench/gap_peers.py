@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from server.bench import Row
 from server.bench import gap_campaign as campaign
+from server.bench.coverage import wilson
 from server.bench.gap_campaign import Case, as_recording
 from server.bench.gap_records import Record
 
@@ -37,9 +38,14 @@ class Answer:
 
 def run(*, quick: bool) -> Iterator[Row]:
     """One table: false alarms, right names and held-out error of every tool, ours last."""
-    groups = _cases(20, 2)
+    yield from part(count=1, quick=True) if quick else part()
+
+
+def part(first: int = 0, count: int | None = None, *, quick: bool = False) -> Iterator[Row]:
+    """The table of ``count`` cases of each of the four groups (all), beginning with number ``first``."""
+    groups = {name: cases[first:][:count] for name, cases in _cases(20, 2).items()}
     if quick:
-        groups = {name: groups[name][:1] for name in ("white", "one, white")}
+        groups = {name: groups[name] for name in ("white", "one, white")}
     tools: dict[str, Select | None] = {
         "forward BIC": _forward_bic,
         "PySINDy STLSQ": _installed(_pysindy, "pysindy"),
@@ -63,7 +69,7 @@ def _cases(healthy: int, each: int) -> dict[str, list[Case]]:
         cases = campaign.healthy(kind, healthy)
         return [Case(c.group, c.number, {}, {**c.options, "reference": "rate"}) for c in cases]
 
-    one = list(campaign.with_rate(3.0, each))
+    one = sorted(campaign.with_rate(3.0, each), key=lambda case: case.seed)
     return {
         "white": plain("white"),
         "coloured": plain("0.95"),
@@ -79,12 +85,18 @@ def _table(tool: str, answers: Mapping[str, Sequence[tuple[Case, Answer]]]) -> I
         first = np.mean([a.names[:1] == tuple(c.effects) for c, a in one])
         only = np.mean([a.names == tuple(c.effects) for c, a in one])
         ratios = [a.ratio for _, a in one]
-        told = f"{len(healthy)} records"
+        told = _interval(alarms, healthy)
         yield Row(f"{tool}: something found in healthy records, {noise}", 100 * float(alarms), "%", ours=told)
-        told = f"{100 * float(only):.0f} % with no other name beside it, {len(one)} records"
+        told = f"{_interval(first, one)}; {100 * float(only):.0f} % with no other name beside it"
         yield Row(f"{tool}: right name first at 3 × detectability, {noise}", 100 * float(first), "%", ours=told)
         told = f"95th percentile {np.quantile(ratios, 0.95):.4g}"
         yield Row(f"{tool}: held-out ÷ floor, median, {noise}", float(np.median(ratios)), "1", ours=told)
+
+
+def _interval(found: Any, answers: Sequence[tuple[Case, Answer]]) -> str:
+    n, seeds = len(answers), [case.seed for case, _ in answers]
+    low, high = wilson(round(float(found) * n), n)
+    return f"{n} records, {100 * low:.0f} to {100 * high:.0f} %, seeds {min(seeds)}…{max(seeds)}"
 
 
 def _installed(select: Select, package: str) -> Select | None:
