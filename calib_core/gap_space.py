@@ -121,6 +121,7 @@ class Space:
             bend = np.gradient(self.felt, samples.interval_s)[:, None]
             self.base = np.column_stack([self.base, self.over_rows(Acts.ANGLE, bend)])
             self.prior = np.append(self.prior, 8.0 / samples.interval_s**2)
+        self._last: RowNoise | None = None  # coloured noise as it was found last
         self._listed: tuple[Term, ...] = ()
         self._places: dict[int, list[int]] = {}
         self.refit_noise([])
@@ -145,16 +146,17 @@ class Space:
         """In which columns are kept."""
         return np.float32 if len(self.rows) > LONG else np.float64
 
-    def refit_noise(self, terms: Iterable[Term], guess: RowNoise | None = None) -> None:
-        """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew. Coloured noise
-        is looked for about the ``guess`` too.
+    def refit_noise(self, terms: Iterable[Term]) -> None:
+        """REML with the base and ``terms`` in the model, so that no effect poses as noise; whitens anew.
 
         The codes' error is a sawtooth, not white; overstated, it leaves nothing for AR(1) noise to pose as.
         """
         columns = np.column_stack([self.base, *(t.columns for t in terms)])
         rows = replace(self.rows, reading_variance=OVERSTATED * self.rows.reading_variance)
         start, longest = RowNoise(self.rough_noise), self.design.longest_noise_s
-        noise = fit_noise(rows, self.residual, columns, self.scale_factor, start, None, guess, longest_s=longest)
+        noise = fit_noise(rows, self.residual, columns, self.scale_factor, start, None, self._last, longest_s=longest)
+        if noise.noise.ar1 > 0.0:
+            self._last = noise.noise
         least = math.log(self._least_noise)
         if noise.logarithms[0] < least:
             # Without rests the encoder's error hides the gyro's noise, but not from the output's own scatter.

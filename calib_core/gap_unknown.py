@@ -60,7 +60,7 @@ def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
         found = list(_tested(space, chosen, [base for base in bases if base[0] == "time_s"]))
         if fast:
             held = np.column_stack([space.base, *(t.columns for t in chosen)])
-            space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))], guess=was.noise)
+            space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))])
             found += _tested(space, chosen, [base for base in bases if base[0] != "time_s"])
             space.use_noise(was)
     return sorted(found, key=lambda s: (s.z < CERTAIN, -s.plain))

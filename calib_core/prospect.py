@@ -65,7 +65,7 @@ class Prospect(Space):
             self.prior = np.zeros(len(values))
         self.use_noise(self.known)
 
-    def refit_noise(self, terms: object, guess: object = None) -> None:  # noqa: ARG002
+    def refit_noise(self, terms: object) -> None:  # noqa: ARG002
         """The noise is that of the data in hand."""
         self.use_noise(self.known)
 
