@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser import PHONE, Server, Window, serious, serving
+from browser import DESK, PHONE, Server, Window, serious, serving
 from recordings import csv_bytes, csv_lines, to_csv
 
 from calib_core.excitation import Excitation, plan_of
@@ -12,6 +12,15 @@ from server import engine
 from server.devices import open_rig
 
 LIMIT_KB = 300
+SECONDS_OPEN, SECONDS_ADD = 0.7, 0.15
+"""Of the page's own computing, by the thread's clock, which a busy machine does not stretch: to open it with everything
+on it, and to add an effect. A server that adds one in 0.15 s (test_workbench.py) leaves 0.3 s in all."""
+MOVED = 0.01
+"""Layout shift that nobody sees: a word of the bar that comes with its language."""
+COUNT_SHIFTS = (
+    "window.shift = 0; new PerformanceObserver(list => { for (const e of list.getEntries())"
+    " if (!e.hadRecentInput) shift += e.value; }).observe({ type: 'layout-shift', buffered: true });"
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +70,18 @@ def ready(window: Window, path: str) -> Any:
     page = window.open(path)
     page.wait_for_selector(".suspects li", timeout=60_000)
     return page
+
+
+def working(window: Window) -> Any:
+    """Tells how long the page's main thread has computed, in seconds."""
+    session = window.context.new_cdp_session(window.page)
+    session.send("Performance.enable", {"timeDomain": "threadTicks"})
+
+    def seconds() -> float:
+        metrics = session.send("Performance.getMetrics")["metrics"]
+        return next(float(m["value"]) for m in metrics if m["name"] == "TaskDuration")
+
+    return seconds
 
 
 def error(window: Window) -> float:
@@ -169,10 +190,21 @@ def test_a_model_is_saved_named_exported_and_stated_on_a_certificate(window: Win
     assert server.call("GET", f"/certificates/{number}/verify")["valid"]
 
 
-def test_the_signal_is_there_within_a_second(window: Window, opened: str) -> None:
-    window.open(opened)
-    ms = window.page.evaluate("performance.getEntriesByName('first-plot')[0].startTime")
-    assert ms < 8000, f"{ms} ms; below 1000 on a machine that does nothing else"
+def test_the_signal_is_drawn_before_anything_is_fitted_and_little_work_is_left_to_the_page(
+    browser: Any, server: Server, opened: str
+) -> None:
+    window = Window(browser, server)
+    seconds = working(window)
+    page = ready(window, opened)
+    fitted = "performance.getEntriesByType('resource').find(entry => entry.name.endsWith('/fit')).startTime"
+    plot, fit = page.evaluate(f"[performance.getEntriesByName('first-plot')[0].startTime, {fitted}]")
+    assert plot <= fit, "the first picture waited for a fit"
+    assert seconds() < SECONDS_OPEN
+    begun = seconds()
+    add(page, "bandwidth_lag", 2)
+    assert seconds() - begun < SECONDS_ADD
+    assert float(page.get_attribute("#held-out", "data-ms")) > 0.0
+    window.close()
 
 
 def test_an_effect_lowers_the_error_a_useless_one_buys_nothing_and_undo_takes_it_back(
@@ -184,7 +216,6 @@ def test_an_effect_lowers_the_error_a_useless_one_buys_nothing_and_undo_takes_it
     after = error(window)
     assert after < 0.3 * before
     assert "nothing but noise" in window.text(".says")
-    assert float(page.get_attribute("#held-out", "data-ms")) < 5000, "below 300 where nothing else runs"
     add(page, "bias_drift", 3)
     assert "buys nothing" in window.text(".steps-bought li:nth-child(3)")
     assert "take it out" in window.text("#bought")
@@ -285,19 +316,18 @@ def test_the_page_is_light_without_its_data(browser: Any, server: Server, opened
     assert sum(kept.values()) < LIMIT_KB * 1000, sorted(kept.items(), key=lambda item: -item[1])[:8]
 
 
-@pytest.mark.parametrize("locale", ["en-US", "th-TH"])
-def test_nothing_scrolls_sideways_or_jumps_on_a_phone(browser: Any, server: Server, opened: str, locale: str) -> None:
-    window = Window(browser, server, viewport=PHONE, locale=locale)
-    window.page.add_init_script(
-        "window.shift = 0; new PerformanceObserver(list => { for (const e of list.getEntries())"
-        " if (!e.hadRecentInput) shift += e.value; }).observe({ type: 'layout-shift', buffered: true });"
-    )
+@pytest.mark.parametrize(("locale", "viewport"), [("en-US", PHONE), ("th-TH", PHONE), ("en-US", DESK)])
+def test_nothing_scrolls_sideways_or_jumps(
+    browser: Any, server: Server, opened: str, locale: str, viewport: dict[str, int]
+) -> None:
+    window = Window(browser, server, viewport=viewport, locale=locale)
+    window.page.add_init_script(COUNT_SHIFTS)
     page = ready(window, opened)
-    assert window.widest() <= PHONE["width"]
-    assert page.evaluate("shift") < 0.1
+    assert window.widest() <= viewport["width"]
+    assert page.evaluate("shift") < MOVED
     window.open("/workbench.html")
     page.wait_for_selector(".example")
-    assert window.widest() <= PHONE["width"]
+    assert window.widest() <= viewport["width"]
     window.close()
 
 

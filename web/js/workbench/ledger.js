@@ -11,7 +11,7 @@ const digits = (error) => decimals(error.floor) ?? 3;
 /** Puts the error and its history into `place`; undo() and compare(index or null) are what its buttons do. */
 export function ledger(place, { undo, compare }) {
   const value = h("output", { class: "leads", id: "held-out" }, "–");
-  const floor = h("p", { class: "muted", id: "floor" }, t("workbench.fitting"));
+  const floor = h("p", { class: "muted", id: "floor" });
   const says = h("p", { class: "small", id: "bought", "aria-live": "polite" });
   const steps = h("ol", { class: "steps-bought" });
   const back = h("button", { type: "button", id: "undo", disabled: true, onclick: undo }, t("workbench.undo"));
