@@ -112,7 +112,8 @@ def diagnose(
     answer.search = search
     answer.asked = search.chosen[: len(effects)]
     answer.rivals = search.rivals()[search.given :]
-    answer.before, answer.after = Explanation(search.space, answer.asked), Explanation(search.space, named(search))
+    answer.before = Explanation(search.space, answer.asked, background=False)
+    answer.after = Explanation(search.space, named(search))
     answer.candidates = _candidates(search, pool, answer)
     found = bool(named(search)[len(effects) :]) or any(
         x is not None for x in (answer.hum, answer.clip, answer.walk, answer.coarse)

@@ -54,8 +54,16 @@ class Failure:
 class Explanation:
     """Base and terms fitted with each block of time left out in turn; residuals of windows in deg/s."""
 
-    def __init__(self, space: Space, terms: Sequence[Term], fixed: Mapping[str, float] | None = None) -> None:
-        """Parameters in ``fixed``, by full name, keep the value given there."""
+    def __init__(
+        self,
+        space: Space,
+        terms: Sequence[Term],
+        fixed: Mapping[str, float] | None = None,
+        *,
+        background: bool = True,
+    ) -> None:
+        """Parameters in ``fixed``, by full name, keep the value given there. Without ``background`` the base is bias
+        and scale factor again, whatever the space has put into it."""
         self.space, self.terms = space, terms
         design, c = space.design, space.covariates
         samples = design.averages.samples
@@ -72,6 +80,9 @@ class Explanation:
         self.middle_s: F64 = samples.time_s[windows.first[self.first] + windows.width // 2] - samples.time_s[0]
         self.gram = space.gram(terms, folds=True)
         self._known = self._granted(fixed or {})
+        if not background:
+            last = self.gram.base
+            self._known |= dict.fromkeys(range(last + 1 - space.background.shape[1], last + 1), 0.0)
         self._free = [k for k in range(1 + self.gram.base, len(self.gram.scale)) if k not in self._known]
 
     def _whole(self, windows: Windows) -> Ints:
@@ -82,7 +93,7 @@ class Explanation:
 
     def _shapes(self) -> tuple[F64, F64]:
         """What base and terms are at the samples: (k, b + p) in deg/s, and (k, p) in deg where terms act on the
-        encoder, turned round. Columns of the base that stand for what is not seen in a window are nothing here."""
+        encoder, turned round. What sampling hides is not seen in a window: its column of the base is nothing here."""
         space = self.space
         k, b, scale = len(space.covariates.time_s), space.base.shape[1], space.scale_factor or 1.0
         width = sum(t.columns.shape[1] for t in self.terms)
@@ -90,6 +101,7 @@ class Explanation:
         rates[:, 0] = 1.0 / scale
         if space.design.moves:
             rates[:, 1] = space.covariates.rate_dps / scale
+        rates[:, b - space.background.shape[1] : b] = space.background / scale
         for term in self.terms:
             end = at + term.columns.shape[1]
             acts, shapes = space.shapes(term)

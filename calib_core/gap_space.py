@@ -84,6 +84,8 @@ class Space:
     """(n, b') their columns, and that of what sampling hides."""
     prior: F64 = field(init=False)
     """(b',) one over the standard deviation that a coefficient is known to have; 0 where nothing is known."""
+    background: F64 = field(init=False)
+    """(k, q) shapes of the output that the base has at last beside bias, rate and what sampling hides."""
     rough_noise: float = field(init=False)
     """Of one sample, from the scatter of neighbours."""
     noise: NoiseFit = field(init=False)
@@ -121,6 +123,7 @@ class Space:
             bend = np.gradient(self.felt, samples.interval_s)[:, None]
             self.base = np.column_stack([self.base, self.over_rows(Acts.ANGLE, bend)])
             self.prior = np.append(self.prior, 8.0 / samples.interval_s**2)
+        self.background = np.empty((len(self.covariates.time_s), 0))
         self._last: RowNoise | None = None  # coloured noise as it was found last
         self._listed: tuple[Term, ...] = ()
         self._places: dict[int, list[int]] = {}
@@ -172,9 +175,11 @@ class Space:
         self._bank: Bank | None = None
         self._whitened: dict[int, tuple[Term, F64]] = {}
 
-    def extend(self, columns: F64, prior: F64) -> None:
-        """Puts columns (n, p) into the base, of whose coefficients ``prior`` (p,) is known: one over a deviation."""
-        self.base = np.column_stack([self.base, columns])
+    def extend(self, shapes: F64, prior: F64) -> None:
+        """Puts shapes (k, p) of the output into the base, of whose coefficients ``prior`` (p,) is known: one over a
+        deviation."""
+        self.background = np.column_stack([self.background, shapes])
+        self.base = np.column_stack([self.base, self.over_rows(Acts.OUTPUT, shapes)])
         self.prior = np.append(self.prior, prior)
         self.use_noise(self.noise)
 

@@ -60,7 +60,9 @@ def wandering(search: Search) -> Walk | None:
     was, now = space.noise, search.deviance(search.chosen)
     space.refit_noise(kept)
     plain = search.deviance(kept)
-    waves, deviations = _series(space)
+    shapes, deviations = _series(space)
+    names = tuple(f"c{k}" for k in range(len(deviations)))
+    waves = Term(Unknown, (), names, space.over_rows(Acts.OUTPUT, shapes), np.zeros(len(names)))
     space.refit_noise([*kept, waves])
     size = np.linspace(math.log(1e-3), math.log(1e3), 61) + math.log(noise.white * 0.1)
     deviance = np.array([_deviance(search, kept, waves, math.exp(u) * deviations) for u in size])
@@ -78,7 +80,7 @@ def wandering(search: Search) -> Walk | None:
     if gain <= 0.0:
         space.use_noise(was)
     else:
-        space.extend(waves.columns, 1.0 / (math.exp(size[best]) * deviations))
+        space.extend(shapes, 1.0 / (math.exp(size[best]) * deviations))
     h = float(size[1] - size[0])
     bend = float(deviance[best - 1] - 2.0 * deviance[best] + deviance[best + 1]) / h**2
     relative = math.sqrt(2.0 / bend) if bend > 0.0 else math.nan
@@ -86,14 +88,12 @@ def wandering(search: Search) -> Walk | None:
     return Walk(math.exp(size[best]), relative, evidence, gain > 0.0, slow if near else ())
 
 
-def _series(space: Space) -> tuple[Term, F64]:
-    """The cosines, and the deviations of their coefficients for a walk of k = 1."""
+def _series(space: Space) -> tuple[F64, F64]:
+    """(k, q) the cosines at the samples, and (q,) the deviations of their coefficients for a walk of k = 1."""
     time = space.covariates.time_s
     end = float(time[-1])
     j = np.arange(1, int(np.clip(end / FASTEST_S, 2, MOST)) + 1)
-    columns = np.column_stack([space.over_rows(Acts.OUTPUT, np.cos(np.pi * k * time / end)[:, None]) for k in j])
-    names = tuple(f"c{k}" for k in j)
-    return Term(Unknown, (), names, columns, np.zeros(len(j))), np.asarray(math.sqrt(2.0 * end) / (math.pi * j), float)
+    return np.cos(np.pi / end * time[:, None] * j), np.asarray(math.sqrt(2.0 * end) / (math.pi * j), float)
 
 
 def _deviance(search: Search, kept: list[Term], waves: Term, deviations: F64) -> float:

@@ -120,6 +120,8 @@ def test_what_is_no_shape_is_named_by_its_own_evidence(effect: str) -> None:
     size = answer["missing"][0]["parameters"][0]
     truth = {"bias_random_walk": 3e-4, "adc_quantization": 9.77e-3}[effect]
     assert size["value"] == pytest.approx(truth, rel=0.01 if effect == "adc_quantization" else 0.6)
+    if effect == "bias_random_walk":
+        assert answer["after"]["held_out_rms_dps"] < 0.5 * answer["error"]["held_out_rms_dps"]
 
 
 def test_asked_effects_stand_in_the_model_and_are_not_missing() -> None:
