@@ -32,6 +32,8 @@ F64 = NDArray[np.float64]
 FORM = 0.03
 """Structure that explains less than this share of what has a name is the name's form, which is never quite right, or
 the error of a reference rate."""
+CLEAR = 25.0
+"""Of χ², what a limit must take away: samples have been sought that it suits."""
 AGREED = 2.0
 """Of χ² on data not seen, what an effect must take away."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
@@ -203,7 +205,7 @@ def _clipped(
     other = min((search.refined(s.term, search.chosen)[1] for s in ranking[:3]), default=everything)
     inside = len(space.rows) - len(kept.rows)
     clipped = without.chi2(without.chosen) + inside
-    if clipped > other:
+    if clipped > min(other, everything - CLEAR):
         return space, search
     answer.clip, answer.clip_gain = clip, everything - clipped
     return kept, without

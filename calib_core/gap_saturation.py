@@ -24,6 +24,8 @@ LEAST = 15
 """So many samples make a level."""
 FEWEST = 100
 """Samples through which the line is drawn."""
+TOP, PLAIN = 4, 60.0
+"""Beside an exact rate: so large a part of the samples may be on a limit, which must explain so much."""
 SETTLED = 3.0
 """So many deviations of the smoothing after a change."""
 SMOOTH_S, STEADY_DPS2, STEADY_S = 0.06, 150.0, 0.1
@@ -37,6 +39,20 @@ class Clip:
     clipped: Mask
     low: float | None
     high: float | None
+
+
+def _limit(output: F64, expected: F64, noise: float) -> tuple[float, float]:
+    """Where the ``output`` (k,) seems to stop although more is ``expected`` of it, and the 2ΔlnL in white ``noise``."""
+    order = np.argsort(-expected)[: len(expected) // TOP]
+    output, expected = output[order], expected[order]
+    # With the m highest on a limit of their own mean: what that takes off the squares about what was expected.
+    m = np.arange(1.0, len(order) + 1.0)
+    mean = np.cumsum(output) / m
+    left = np.cumsum(output**2) - m * mean**2
+    gain = (np.cumsum((output - expected) ** 2) - left) / noise**2
+    gain[(m < LEAST) | (mean > expected)] = 0.0
+    best = int(np.argmax(gain))
+    return float(mean[best]), float(gain[best])
 
 
 def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip | None:
@@ -63,7 +79,13 @@ def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip 
     spread = float(np.std(s.output[inner] - expected[inner]))
     limits: dict[float, float] = {}
     clipped = np.zeros(len(s.output), bool)
-    for side in (-1.0, 1.0):
+    if design.reference == "rate":
+        for side in (-1.0, 1.0):
+            limit, gain = _limit(side * s.output, side * expected, noise)
+            if gain > PLAIN:
+                limits[side] = side * limit
+                clipped |= side * expected > limit
+    for side in (-1.0, 1.0) if not limits else ():
         top = side * s.output
         extreme = float(np.quantile(top, 1.0 - 5.0 / len(top)))
         on = steady & (top > extreme - 2.0 * LEVEL * noise)

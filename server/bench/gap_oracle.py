@@ -72,7 +72,9 @@ def whitened(values: F64, white: float, ar1: float, phi: float) -> F64:
     half = variance / (2.0 * phi * white**2)
     theta = half - np.sqrt(half**2 - 1.0)
     innovation = np.sqrt(phi * white**2 / theta)
-    return np.asarray(lfilter([1.0, -phi], [1.0, -theta], values - values[0], axis=0)[1:] / innovation)
+    # What went before was as the first value, as far as the filter knows: a constant stays one.
+    constant = values[0] * (1.0 - phi) / (1.0 - theta)
+    return np.asarray((lfilter([1.0, -phi], [1.0, -theta], values - values[0], axis=0) + constant)[1:] / innovation)
 
 
 def _on_the_encoder(values: F64, moved: F64, codes: F64, white: float, ar1: float, phi: float) -> F64:
