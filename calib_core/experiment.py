@@ -21,6 +21,7 @@ from calib_core.contest import Columns, Contest, sizes_in, usual, values_of
 from calib_core.effects import Effect
 from calib_core.excitation import Excitation, menu
 from calib_core.gap import BY_ITSELF, Diagnosis
+from calib_core.gap_search import form
 from calib_core.gap_space import Space, Term
 from calib_core.gyro_models import PRESETS, GyroModel
 from calib_core.problem import Problem
@@ -148,8 +149,13 @@ def separate(
     contest = Contest(hand, [(t.effect, t.setting, sizes_in(hand, t)) for t in rivals], [t.effect for t in rivals])
     pairs = list(combinations(range(len(rivals)), 2))
 
+    def told(columns: Columns, truth: int, rival: int) -> float:
+        """Beyond what a tie between two so large would be allowed."""
+        allowed = form(rivals[truth].effect, rivals[rival].effect, contest.left(columns, truth))
+        return max(contest.left(columns, truth, rival) - allowed, 0.0)
+
     def evidence(columns: Columns) -> tuple[float, ...]:
-        return tuple(min(contest.left(columns, i, j), contest.left(columns, j, i)) for i, j in pairs)
+        return tuple(min(told(columns, i, j), told(columns, j, i)) for i, j in pairs)
 
     offered = [Offer(motion, evidence(columns)) for motion, columns in _played(contest, rig, sensor)]
     before = evidence(contest.in_hand)

@@ -380,11 +380,15 @@ class Search:
 
 
 def _margin(best: Suspicion, other: Suspicion) -> float:
-    """2ΔlnL within which ``other`` serves as well as the ``best``: forms are never quite right, but those of late
-    answers, which are series in the same small number; and a step is at the best of many places."""
-    if best.term.effect.curvature is not None and other.term.effect.curvature is not None:
-        return RIVAL
-    return RIVAL + 0.5 * SHARE * best.gain + (TUNED if best.term.effect.nonlinear() else 0.0)
+    """2ΔlnL within which ``other`` serves as well as the ``best``; a step is at the best of many places."""
+    tuned = best.term.effect.nonlinear() and best.term.effect.curvature is None
+    return RIVAL + form(best.term.effect, other.term.effect, best.gain) + (TUNED if tuned else 0.0)
+
+
+def form(best: type[Effect], other: type[Effect], gain: float) -> float:
+    """How much of the ``gain`` of ``best`` its form may owe to chance: forms are never quite right, but those of late
+    answers, which are series in the same small number."""
+    return 0.0 if best.curvature is not None and other.curvature is not None else 0.5 * SHARE * gain
 
 
 def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:
