@@ -145,6 +145,10 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         bench.click("text=Run it")
         link = bench.locator("a.open").get_attribute("href")
         assert re.search(rf"recording=\w+&axis=x&lab={code}&notebook=\w+", link)
+        bench.click("a.open")
+        bench.wait_for_selector("[data-effect=hysteresis] .add", timeout=60_000)
+        bench.wait_for_selector(".lines:has-text('Opened')")
+        bench.click("text=Back to the bench")
         bench.click("text=Hand in >> nth=-1")
         bench.wait_for_selector("text=Say what is hidden")
         bench.check("input[value=found]")
@@ -152,7 +156,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         bench.fill("#reasoning", "It jumps when the rotation turns round.")
         bench.click("text=Hand in >> nth=-1")
         bench.wait_for_selector("text=Handed in at")
-        bench.wait_for_selector(".lines li:nth-child(2):last-child >> text=Handed in: hysteresis")
+        bench.wait_for_selector(".lines li:last-child >> text=Handed in: hysteresis")
         assert student.widest() <= PHONE["width"]
 
         page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # the teacher looks again

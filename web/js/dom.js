@@ -38,12 +38,12 @@ export function say(place, problem) {
   place.textContent = problem ? problem.message : "";
 }
 
-/** A paragraph that says since when it waits, until it is taken out: long work must not look dead.
+/** A paragraph (or another element) that says since when it waits, until it is taken out: long work must not look dead.
  * ask() may give what is being done now, in words. */
-export function waiting(text, ask = null) {
+export function waiting(text, ask = null, tag = "p") {
   const what = h("span", { role: "status" }, text);
   const seconds = h("span", { "aria-hidden": "true" });
-  const node = h("p", { class: "muted" }, what, seconds);
+  const node = h(tag, { class: "muted" }, what, seconds);
   const began = performance.now();
   const timer = setInterval(async () => {
     if (!node.isConnected) { clearInterval(timer); return; }

@@ -1,7 +1,7 @@
 // What is looked at: the signal with its model, the residual in time, along whatever it may depend on, and its spectrum.
 
 import { chart } from "../chart.js";
-import { h } from "../dom.js";
+import { h, waiting } from "../dom.js";
 import { t } from "../text.js";
 
 const GROUP = "workbench";
@@ -13,7 +13,7 @@ export const alongName = ({ kind, axis, covariate }) => t(`diagnosis.along.${kin
 
 /** The pictures of one recording, or of readings ("rate" or "position" in `points`) against their reference. detail([from, to]) gives a fit of a stretch in full; pointed(along) hears a guess. */
 export function pictures(place, { unit, points, detail, pointed }) {
-  const sentence = h("h1", { class: "says" });
+  const sentence = h("h1", { class: "says" }, h("span", { class: "limits" }, waiting(t("workbench.fitting"), null, "span")));
   const traces = h("div", { class: "stack traces" });
   const grid = h("div", { class: "multiples" });
   place.replaceChildren(sentence, traces,
@@ -23,7 +23,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
   const left = points ? unit : "deg/s";
   let shown = null;
   let base = 0;
-  let waiting = 0;
+  let asking = 0;
   let compared = null;
   let isHiding = false;
   let untested = null;
@@ -47,9 +47,9 @@ export function pictures(place, { unit, points, detail, pointed }) {
   const multiples = new Map();
 
   function onZoom(range) {
-    clearTimeout(waiting);
+    clearTimeout(asking);
     if (!shown || shown.whole) return;
-    waiting = setTimeout(async () => {
+    asking = setTimeout(async () => {
       const of = shown;
       const part = range ? await detail(range) : of;
       if (shown === of) drawSignal(part);
