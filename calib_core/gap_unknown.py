@@ -21,9 +21,9 @@ from calib_core.gap_space import FEIGNED_STEPS, LONG, TOGETHER, Space, Term
 F64 = NDArray[np.float64]
 
 CERTAIN = 4.0
-"""The |z| that a shape must reach: one healthy record in thousands does, over all six covariates."""
+"""The |z| that a shape must reach: one healthy record in thousands does, over all seven covariates."""
 HARMONICS = range(3, 13)
-UNFEIGNED = ("temperature_c", "time_s", "other_rate_dps")
+UNFEIGNED = ("temperature_c", "supply_v", "time_s", "other_rate_dps")
 """What goes on for many seconds, or with the other axis, the codes of this one do not feign."""
 SINCE_REVERSAL_S = (0.0, 0.1, 0.3, 1.0, 3.0)
 
@@ -117,6 +117,8 @@ def _shapes(space: Space) -> Iterator[tuple[str, F64]]:
         yield f"{c.axis}_rate_dps", over(bumps) @ _curved(bumps, np.linspace(-1.0, 1.0, 21))
     if c.temperature_c is not None and np.ptp(c.temperature_c) > 0.5:
         yield "temperature_c", over(_bumps(c.temperature_c, 10))
+    if c.supply_v is not None and np.ptp(c.supply_v) > 0.005:
+        yield "supply_v", over(_bumps(c.supply_v, 8))
     if c.time_s[-1] > 20.0:
         yield "time_s", over(_bumps(c.time_s, 16))
     if c.other_rate_dps is not None and np.ptp(c.other_rate_dps) > 10.0:

@@ -18,6 +18,8 @@ AR1_EVIDENCE = 8.0
 """2ΔlnL that the two parameters of AR(1) noise must buy."""
 GUESSES = [(0.95, 0.05), (0.95, 0.3), (0.95, 2.0), (0.8, 0.05), (0.8, 0.3), (0.8, 2.0), (0.99, 1.0), (0.995, 3.0)]
 """White noise's share, and the correlation time of the rest: the slower, the less of it is plain to see."""
+ALIKE = 1e-11
+"""What is added to squares, so that columns as good as alike once they are whitened do no harm."""
 ENOUGH = 0.02
 """A relative step in the noise that no longer matters."""
 MAX_CORRELATION_S = 5.0
@@ -82,12 +84,16 @@ def fit_noise(
     columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
     both = np.column_stack([columns / np.sqrt((columns**2).mean(axis=0)), y])
 
+    alike = ALIKE * np.eye(both.shape[1])
+
     def deviance_of(fit: NoiseFit) -> Callable[[F64], float]:
         def deviance(logarithms: F64) -> float:
             """-2 ln of the restricted likelihood, up to a constant."""
             whitener = Whitener(rows, scale_factor, fit.at(logarithms))
             white = whitener.whiten(both)
-            diagonal = np.diag(np.linalg.cholesky(white.T @ white))
+            gram = white.T @ white
+            size = np.sqrt(np.diag(gram))
+            diagonal = size * np.diag(np.linalg.cholesky(gram / np.outer(size, size) + alike))
             return float(whitener.log_determinant + 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2)
 
         return deviance
