@@ -228,11 +228,10 @@ class _Record:
         return np.array([a for a, _, _ in found]), np.array([v for _, _, v in found], float)
 
     def _sums(self, frequency: float) -> list[tuple[C128, C128, float]]:
-        turn = np.exp(-2j * np.pi * frequency * self.time)
         sums = []
-        for k in range(self.pieces):
-            w = np.where(self.piece == k, self.weight, 0.0) if self.pieces > 1 else self.weight
-            sums.append((np.asarray(w @ (self.quick * turn)), np.asarray(w @ turn**2), float(w.sum())))
+        for a, b in pairwise([*np.searchsorted(self.piece, np.arange(self.pieces)).tolist(), len(self.piece)]):
+            w, turn = self.weight[a:b], np.exp(-2j * np.pi * frequency * self.time[a:b])
+            sums.append((np.asarray((w * self.quick[a:b]) @ turn), np.asarray(w @ turn**2), float(w.sum())))
         return sums
 
 
