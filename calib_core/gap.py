@@ -21,7 +21,7 @@ from calib_core.gap_search import SHARE, Search, Suspicion
 from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_spikes import spikes
-from calib_core.gap_unknown import CERTAIN, Structure, structures
+from calib_core.gap_unknown import CERTAIN, Structure, strongest
 from calib_core.gap_wander import Walk, wandering
 from calib_core.integral_fit import Design
 from calib_core.problem import Problem
@@ -248,17 +248,17 @@ def _beyond(search: Search, step: float) -> None:
 
 def _structure(answer: Diagnosis, search: Search) -> None:
     """Flags what no library effect explains; names that do not pass beside it are dropped."""
-    found = structures(search.space, search.chosen)
     explained = search.chi2([]) - search.chi2(search.chosen)
+    found = strongest(search.space, search.chosen)
     form = SHARE if search.space.design.reference == "encoder" else FORM
-    if not found or found[0].z < CERTAIN or found[0].gain < form * explained:
+    if found is None or found.z < CERTAIN or found.gain < form * explained:
         return
-    answer.unknown = found[0]
+    answer.unknown = found
     names = {t.name for t in search.chosen[search.given :]}
     asked = search.chosen[: search.given]
     few = {n: e for n, e in search.suspects.items() if n in names}
     beside = Search(search.space, few, search.rng, columns=search.columns)
-    beside.chosen = [*asked, found[0].term]
+    beside.chosen = [*asked, found.term]
     beside.given = len(beside.chosen)
     beside.run()
     search.chosen = [*asked, *beside.chosen[beside.given :]]

@@ -190,7 +190,10 @@ class Explanation:
         shown = -angles @ sizes[self.gram.base :]
 
         def squares(noise: RowNoise) -> F64:
-            return gyro**2 + coded(self.space.design, self.windows, rate, shown, noise)[self.first]
+            self.space.forget()
+            found = gyro**2 + coded(self.space.design, self.windows, rate, shown, noise)[self.first]
+            self.space.forget()
+            return found
 
         first = squares(noise)
         misfit = float(np.mean(self.residual(sizes) ** 2 - first))

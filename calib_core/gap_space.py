@@ -184,9 +184,11 @@ class Space:
         self.use_noise(self.noise)
 
     def forget(self) -> None:
-        """Gives the memory of a long record's whitened columns back; they are made again when they are asked for."""
+        """Gives back the memory of a long record's whitened columns, and of what makes means of its samples; both are
+        made again when they are asked for."""
         if len(self.rows) > LONG:
             self._bank = None
+            self.design.averages.forget()
 
     def enlist(self, terms: Sequence[Term]) -> None:
         """These will be asked for together, again and again: their Gram matrix is made once for each noise."""

@@ -47,23 +47,27 @@ class Structure:
     """The |z| with it: what follows one covariate is seen along others too, but less."""
 
 
-def structures(space: Space, chosen: Sequence[Term]) -> list[Structure]:
-    """Every covariate's shape beside base and ``chosen``: what is certain first, and of that what explains most."""
+def strongest(space: Space, chosen: Sequence[Term]) -> Structure | None:
+    """Of every covariate's shape beside base and ``chosen`` the one that explains most of those that are certain, or of
+    all where none is; None where nothing varies. Only two are kept at a time: their columns are many."""
     was = space.noise
     if was.noise.ar1 == 0.0 or len(space.rows) > LONG:
-        found = list(_tested(space, chosen, _bases(space)))
-    else:
-        # What has no name yet is in no model, and poses as noise that is correlated over seconds. What goes on for so
-        # long and follows nothing but time is that noise as likely as not.
-        bases = list(_bases(space))
-        fast = [columns for name, columns in bases if name != "time_s"]
-        found = list(_tested(space, chosen, [base for base in bases if base[0] == "time_s"]))
-        if fast:
-            held = np.column_stack([space.base, *(t.columns for t in chosen)])
-            space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))])
-            found += _tested(space, chosen, [base for base in bases if base[0] != "time_s"])
-            space.use_noise(was)
-    return sorted(found, key=lambda s: (s.z < CERTAIN, -s.plain))
+        return min(_tested(space, chosen, _bases(space)), key=_rank, default=None)
+    # What has no name yet is in no model, and poses as noise that is correlated over seconds. What goes on for so
+    # long and follows nothing but time is that noise as likely as not.
+    bases = list(_bases(space))
+    fast = [columns for name, columns in bases if name != "time_s"]
+    found = list(_tested(space, chosen, [base for base in bases if base[0] == "time_s"]))
+    if fast:
+        held = np.column_stack([space.base, *(t.columns for t in chosen)])
+        space.refit_noise([*chosen, _as_term(_basis(np.column_stack(fast), held))])
+        found += _tested(space, chosen, [base for base in bases if base[0] != "time_s"])
+        space.use_noise(was)
+    return min(found, key=_rank, default=None)
+
+
+def _rank(structure: Structure) -> tuple[bool, float]:
+    return structure.z < CERTAIN, -structure.plain
 
 
 def _bases(space: Space) -> Iterator[tuple[str, F64]]:
