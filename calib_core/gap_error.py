@@ -37,7 +37,11 @@ class Error:
 
 
 HARDLY = {"temperature_c": 0.2, "supply_v": 0.005, "other_rate_dps": 1.0}
-"""A covariate that varies less is constant but for its own noise: nothing fails along it."""
+"""A covariate that usually varies less is constant but for its own noise: nothing fails along it."""
+USUALLY = (0.02, 0.98)
+
+
+TIME_LEADS = 0.5
 
 
 @dataclass(frozen=True)
@@ -208,12 +212,12 @@ class Explanation:
         return {n: self.windows.mean(v[:, None])[self.first, 0] for n, v in covariate_columns(self.space).items()}
 
     def failures(self) -> list[Failure]:
-        """The worst stretch of each covariate, worst first: bins of equal count against the mean of their noise."""
+        """The worst stretch of each covariate, plainest first: bins of equal count against the mean of their noise."""
         residual, spread = self.residual(self.solution[0]), self.spread
         found = []
         for name, at in self.along().items():
             order = np.argsort(at, kind="stable")
-            if np.ptp(at) <= HARDLY.get(name, 0.0) or len(order) < 2 * BINS:
+            if np.ptp(np.quantile(at, USUALLY)) <= HARDLY.get(name, 0.0) or len(order) < 2 * BINS:
                 continue
             parts = _stretches(at[order], order)
             # Windows overlap by half: two neighbours count as one and a half.
@@ -225,7 +229,8 @@ class Explanation:
                     name, float(at[worst].min()), float(at[worst].max()), float(residual[worst].mean()), float(z[k])
                 )
             )
-        return sorted(found, key=lambda f: -abs(f.z))
+        # Whatever is slow is seen along time as well: time leads only where nothing else is nearly as plain.
+        return sorted(found, key=lambda f: -abs(f.z) * (TIME_LEADS if f.covariate == "time_s" else 1.0))
 
 
 def _stretches(values: F64, order: Ints) -> list[Ints]:
