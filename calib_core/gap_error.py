@@ -220,6 +220,8 @@ class Explanation:
             if np.ptp(np.quantile(at, USUALLY)) <= HARDLY.get(name, 0.0) or len(order) < 2 * BINS:
                 continue
             parts = _stretches(at[order], order)
+            if not parts:  # a short record, and most of it at one value
+                continue
             # Windows overlap by half: two neighbours count as one and a half.
             z = np.array([residual[p].mean() / (np.sqrt(np.mean(spread[p] ** 2) / len(p)) * 1.2) for p in parts])
             k = int(np.argmax(np.abs(z)))

@@ -72,7 +72,7 @@ def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip 
     settled = inner & minimum_filter1d(steady, 2 * round(SETTLED * SMOOTH_S / s.interval_s) + 1)
     if settled.sum() >= FEWEST:
         inner = settled
-    if reach < 20.0 * noise or inner.sum() < FEWEST:
+    if reach < 20.0 * noise or inner.sum() < FEWEST or np.ptp(rate[inner]) == 0.0:
         return None
     fit = np.polynomial.Polynomial.fit(rate[inner], s.output[inner], 1)
     expected = fit(rate)

@@ -1,7 +1,7 @@
 """Bad recordings of every kind are recognised before anything is fitted, and good ones are let through."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,11 @@ from calib_core.gap import prepare
 from calib_core.gap_checks import Check, checks
 from calib_core.recording import Recording, read
 from server.bench.gap_records import EFFECTS, record
+from server.diagnosis import of_recording, told
 from server.texts import render, texts
 
 F64 = NDArray[np.float64]
+Bad = Callable[[Recording], Recording]
 
 
 def recording(effects: Mapping[str, float], seed: int = 5, **options: object) -> Recording:
@@ -218,6 +220,62 @@ def test_a_single_sample_far_out_of_line_is_told_and_left_out(good: Recording, a
     assert wrong(odd)["spikes"].values["at_s"] == level.time_s[at]
     assert not wrong(odd)["spikes"].blocking
     assert np.setdiff1d(np.arange(1200), prepare(odd, "x").design.averages.samples.index).tolist() == [at % 1200]
+
+
+@pytest.fixture(scope="module")
+def short(good: Recording) -> Recording:
+    """26 s of rest and one sine."""
+    return good.take(slice(0, 2600))
+
+
+def _late(short: Recording, seconds: float) -> Recording:
+    return replace(short, time_s=short.time_s + seconds * (np.arange(len(short)) >= 1300))
+
+
+def _held(short: Recording, value: float) -> F64:
+    return np.where(np.arange(len(short)) // 400 == 2, value, short.columns["x_gyro_v"])
+
+
+def _scaled(name: str) -> Bad:
+    return lambda s: changed(s, **{name: 1e3 * s.columns[name]})
+
+
+BAD: Mapping[str, tuple[Bad, str]] = {
+    "nothing moves": (lambda s: changed(s, x_gyro_v=noise(s), x_position_deg=np.zeros(len(s))), "no_motion"),
+    "the encoder stands": (lambda s: changed(s, x_position_deg=np.zeros(len(s))), "reference_stands"),
+    "no encoder": (lambda s: changed(s, x_position_deg=np.full(len(s), np.nan)), "no_reference"),
+    "no temperature": (lambda s: changed(s, temperature_c=None), "no_temperature"),
+    "3 s": (lambda s: s.take(slice(0, 300)), "too_short"),
+    "stuck": (lambda s: changed(s, x_gyro_v=np.full(len(s), 1.25)), "never_changes"),
+    "stuck for 4 s": (lambda s: changed(s, x_gyro_v=_held(s, s.columns["x_gyro_v"][800])), "stuck"),
+    "clipped": (lambda s: changed(s, x_gyro_v=np.clip(s.columns["x_gyro_v"], 1.2, 1.3)), "railed"),
+    "other axis": (
+        lambda s: changed(s, x_position_deg=s.columns["z_position_deg"], z_position_deg=s.columns["x_position_deg"]),
+        "axes_swapped",
+    ),
+    "other sign": (lambda s: changed(s, x_gyro_v=2.5 - s.columns["x_gyro_v"]), "reversed"),
+    "an open input": (lambda s: changed(s, x_gyro_v=noise(s, 1.4)), "does_not_answer"),
+    "mV for V": (_scaled("x_gyro_v"), "out_of_range"),
+    "millidegrees": (_scaled("x_position_deg"), "unit_implausible"),
+    "milliseconds": (lambda s: replace(s, time_s=1e3 * s.time_s), "unit_implausible"),
+    "m°C for °C": (_scaled("temperature_c"), "covariate_impossible"),
+    "5 s more on the clock": (lambda s: _late(s, 5.0), "time_gaps"),
+    "5 s less on the clock": (lambda s: _late(s, -5.0), "time_repeats"),
+    "samples that are lost": (lambda s: changed(s, x_gyro_v=_held(s, np.nan)), "time_gaps"),
+}  # fmt: skip
+TOLD = ("no_temperature", "time_gaps")
+"""These are told, and what can be known is."""
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_recording_gets_a_sentence_and_no_name(short: Recording, name: str) -> None:
+    bad, expected = BAD[name]
+    answer = told(of_recording(bad(short), axis="x"), "en")
+    wrong = {check["code"].rsplit(".", 1)[1]: check["sentence"] for check in answer["checks"] if not check["ok"]}
+    assert len(wrong[expected]) > 20
+    assert answer["missing"] == []
+    assert answer["verdict"] == ("adequate" if expected in TOLD else "not_testable")
+    assert answer["sentence"] in wrong.values() or expected in TOLD
 
 
 @given(recordings())
