@@ -85,10 +85,13 @@ class Contest:
         return min(columns.unexplained(truth, [*self._held, *place]) for place in self._places[fit])
 
     def _columns(self, space: Space) -> Columns:
-        """[signals, base, kept, fits at every setting], whitened."""
+        """[signals, base, kept, fits at every setting], whitened. A bias that wanders begins anew in another record."""
         found = [_term(space, effect, setting).columns @ sizes for effect, setting, sizes in self.truths]
-        base = np.zeros((len(space.base), BASE))
-        base[:, : space.base.shape[1]] = space.base
+        q, own = self.hand.space.background.shape[1], space.base.shape[1] - space.background.shape[1]
+        base = np.zeros((len(space.base), BASE + q))
+        base[:, :own] = space.base[:, :own]
+        if space is self.hand.space:
+            base[:, BASE:] = space.base[:, own:]
         parts = [np.column_stack(found), base, *(_term(space, t.effect, t.setting).columns for t in self.hand.kept)]
         width = sum(p.shape[1] for p in parts)
         self._held = list(range(len(found), width))
@@ -104,11 +107,14 @@ class Contest:
         return Columns.of(space.whitener.whiten(np.column_stack(parts)))
 
     def _prior(self, space: Space) -> F64:
-        """(1, p) what is known beforehand: how much point samples may hide. Both records share that coefficient."""
-        row = np.zeros((1, self._held[-1] + 1 + sum(len(p) for places in self._places for p in places)))
-        if len(space.prior) == BASE:
-            row[0, self._held[0] + BASE - 1] = space.prior[-1]
-        return row
+        """(1 + q, p) what is known beforehand: how much point samples may hide, a coefficient that both records share;
+        and how far the bias wanders in this one."""
+        q, first = space.background.shape[1], self._held[0]
+        rows = np.zeros((1 + q, self._held[-1] + 1 + sum(len(p) for places in self._places for p in places)))
+        if len(space.prior) - q == BASE:
+            rows[0, first + BASE - 1] = space.prior[BASE - 1]
+        rows[1 + np.arange(q), first + BASE + np.arange(q)] = space.prior[len(space.prior) - q :]
+        return rows
 
 
 def usual(space: Space, effect: type[Effect]) -> tuple[Setting, F64]:

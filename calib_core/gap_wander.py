@@ -52,7 +52,7 @@ def wandering(search: Search) -> Walk | None:
     space has it in its base from then on; otherwise nothing has changed."""
     space, given = search.space, search.given
     kept = [t for k, t in enumerate(search.chosen) if k < given or t.name not in SLOW]
-    slow = tuple(t.name for t in search.chosen[given:] if t.name in SLOW)
+    slow = [t for t in search.chosen[given:] if t.name in SLOW]
     noise = space.noise.noise
     at_limit = noise.ar1 > 0.0 and noise.correlation_time_s > NEAR_LIMIT * space.noise.longest_s
     if len(kept) == len(search.chosen) and not at_limit:
@@ -72,8 +72,9 @@ def wandering(search: Search) -> Walk | None:
     # Of what strong slow shapes explain, a share is always their form, which a walk mends without being one.
     margin += FORM * max(plain - now - STRONG, 0.0)
     gain = now - float(deviance[best]) - margin
-    # A walk's waves are weighed with all their sizes, a shape is at its best: that is worth so much to each shape.
-    near = bool(slow) and abs(gain) < RIVAL + TUNED * len(slow)
+    # A walk's waves are weighed with all their sizes, shapes are at their best: so much is each of theirs worth.
+    fitted = sum(t.freedom + len(t.setting) for t in slow)
+    near = bool(slow) and abs(gain + margin) < RIVAL + TUNED * fitted
     if deviance[best] > plain - EVIDENCE or not (gain > 0.0 or near) or not 0 < best < len(size) - 1:
         space.use_noise(was)
         return None
@@ -85,7 +86,7 @@ def wandering(search: Search) -> Walk | None:
     bend = float(deviance[best - 1] - 2.0 * deviance[best] + deviance[best + 1]) / h**2
     relative = math.sqrt(2.0 / bend) if bend > 0.0 else math.nan
     evidence = float(plain - deviance[best])
-    return Walk(math.exp(size[best]), relative, evidence, gain > 0.0, slow if near else ())
+    return Walk(math.exp(size[best]), relative, evidence, gain > 0.0, tuple(t.name for t in slow) if near else ())
 
 
 def _series(space: Space) -> tuple[F64, F64]:

@@ -20,6 +20,8 @@ GUESSES = [(0.95, 0.05), (0.95, 0.3), (0.95, 2.0), (0.8, 0.05), (0.8, 0.3), (0.8
 """White noise's share, and the correlation time of the rest: the slower, the less of it is plain to see."""
 ALIKE = 1e-11
 """What is added to squares, so that columns as good as alike once they are whitened do no harm."""
+IMPOSSIBLE = 1e12
+"""In place of a -2lnL that cannot be had."""
 ENOUGH = 0.02
 """A relative step in the noise that no longer matters."""
 MAX_CORRELATION_S = 5.0
@@ -93,7 +95,10 @@ def fit_noise(
             white = whitener.whiten(both)
             gram = white.T @ white
             size = np.sqrt(np.diag(gram))
-            diagonal = size * np.diag(np.linalg.cholesky(gram / np.outer(size, size) + alike))
+            try:
+                diagonal = size * np.diag(np.linalg.cholesky(gram / np.outer(size, size) + alike))
+            except np.linalg.LinAlgError:
+                return IMPOSSIBLE  # a step too far
             return float(whitener.log_determinant + 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2)
 
         return deviance

@@ -8,8 +8,9 @@ from shared import shared
 
 from calib_core import gap, recording
 from calib_core.effects import library
+from calib_core.experiment import propose
 from calib_core.gap import Diagnosis, diagnose, named
-from calib_core.gap_report import to_json
+from calib_core.gap_report import _ties, to_json
 from calib_core.recording import Recording
 from server.bench import gap_records
 
@@ -122,6 +123,21 @@ def test_what_is_no_shape_is_named_by_its_own_evidence(effect: str) -> None:
     assert size["value"] == pytest.approx(truth, rel=0.01 if effect == "adc_quantization" else 0.6)
     if effect == "bias_random_walk":
         assert answer["after"]["held_out_rms_dps"] < 0.5 * answer["error"]["held_out_rms_dps"]
+
+
+def test_beside_a_bias_that_wanders_ties_are_declared_and_a_motion_is_proposed() -> None:
+    diagnosis = diagnose(made(31, {"bias_random_walk": 1.0, "bandwidth_lag": 0.5}, plan="second"), "x")
+    assert diagnosis.walk is not None
+    assert {"bandwidth_lag", "time_offset"} <= told(diagnosis)
+    proposal = propose(diagnosis)
+    assert proposal is not None
+    assert proposal.kind == "rivals"
+
+
+def test_a_walk_and_shapes_that_serve_as_well_are_told_as_rivals_or_as_sets() -> None:
+    alternatives = [[["bias_random_walk"], ["bias_step"]], [["bias_random_walk"], ["bias_drift", "warm_up"]]]
+    answer = Diagnosis(made(7, {}), "x", [], alternatives=alternatives)
+    assert _ties(answer) == {"rivals": [["bias_random_walk", "bias_step"]], "rival_sets": [alternatives[1]]}
 
 
 def test_asked_effects_stand_in_the_model_and_are_not_missing() -> None:
