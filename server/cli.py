@@ -20,7 +20,19 @@ from server import __version__
 from server import commands as rooms
 from server.texts import LANGUAGES, render, sentence
 
-FIRST = ("serve", "calibrate", "diagnose", "certify", "verify", "thesis", "import", "export", "bench")
+FIRST = (
+    "serve",
+    "calibrate",
+    "diagnose",
+    "certify",
+    "verify",
+    "thesis",
+    "effects",
+    "models",
+    "import",
+    "export",
+    "bench",
+)
 BAD_USE, FAILED, INTERRUPTED = 2, 1, 130
 
 # argparse's own sentences, in its words, and the texts that replace them.

@@ -1,5 +1,6 @@
 """A user's own effect: kept, listed, hidden in a twin, named by the diagnosis, taken out again, forgotten."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -97,3 +98,17 @@ def test_over_http_it_is_made_listed_and_forgotten(tmp_path: Path) -> None:
     assert client.delete("/effects/bias_drift").status_code == 409
     assert client.delete("/effects/seven_waves").status_code == 204
     assert client.delete("/effects/seven_waves").status_code == 404
+
+
+def test_the_command_keeps_lists_and_forgets_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def said(*words: str) -> tuple[int, str]:
+        code = cli.main(["effects", "--data", str(tmp_path), *words])
+        return code, "".join(capsys.readouterr())
+
+    made = ["--add", "seven_waves", "--formula", OWN["formula"], "--parameter", "a", "--note", "cogging"]
+    assert "your own: a × (sin(7 * radians(position_deg)))" in said(*made)[1]
+    code, told = said("--lang", "th")
+    assert (code, "ของคุณเอง" in told, "warm_up" in told) == (0, True, True)
+    assert json.loads(said("--json")[1])["effects"][-1]["summary"] == "cogging"
+    assert said(*made)[0] == said("--add", "b", "--formula", "rate_dps.real")[0] == said("--remove", "warm_up")[0] == 2
+    assert "seven_waves" not in said("--remove", "seven_waves")[1]

@@ -141,3 +141,23 @@ def test_a_model_of_another_board_axis_or_unit_corrects_nothing(data: Path, sess
         saved(data, axis="y")
     with pytest.raises(Problem, match=r"diagnosis\.effect_not_possible"):
         saved(data, "bias_temperature")
+
+
+def test_the_command_fits_keeps_lists_and_forgets_models(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def said(*words: str) -> tuple[int, str]:
+        code = cli.main(["models", *words, "--data", str(data)])
+        return code, "".join(capsys.readouterr())
+
+    assert cli.main(["models", "--data", str(tmp_path / "new")]) == 0
+    assert "No model is saved" in capsys.readouterr().out
+    assert "--recording is missing" in said("--save", "by hand")[1]
+    fit = ["--effects", "scale_factor_cubic, time_offset", "--board", "LPY-3", "--note", "n"]
+    code, told = said("--save", "by hand", "--recording", recording_in(data), *fit)
+    line = next(line for line in told.splitlines() if "by hand" in line)
+    assert (code, "LPY-3 x, scale_factor_cubic, time_offset" in line, " deg/s" in line) == (0, True, True)
+    made = next(row for row in json.loads(said("--json")[1])["models"] if row["name"] == "by hand")
+    assert (made["note"], line.split()[0]) == ("n", made["id"])
+    assert "by hand" not in said("--remove", made["id"])[1]
+    assert said("--remove", made["id"])[0] == 2
