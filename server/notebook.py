@@ -9,7 +9,7 @@ from server.texts import render, texts
 
 Words = dict[str, Any]
 
-DEEPEST = 8
+DEEPEST = 10
 OWN_WORDS = {"guessed": "why", "note": "text", "submitted": "reasoning"}
 """Where a step keeps what the student wrote."""
 

@@ -20,6 +20,8 @@ TOLD_BY = {
     "time": ("bias_drift", "bias_step", "warm_up", "bias_random_walk", "mains_hum", "adc_quantization"),
 }  # fmt: skip
 """What a motion has to do enough of for these effects to show."""
+WARMED_DEGC = 2.0
+"""Past this it is not the temperature that was missing, but rates at several of them."""
 RECORDED = ("temperature", "supply", "other_rate")
 """What a recording may not have at all."""
 
@@ -34,6 +36,8 @@ def why(row: Mapping[str, Any], reach: Mapping[str, Any]) -> Words:
     told_by = next((name for name, effects in TOLD_BY.items() if row["effect"] in effects), "other")
     if row["status"] == "no_data":
         return {"code": f"untested.no_{told_by if told_by in RECORDED else 'other'}", "values": {}}
+    if row["effect"] == "scale_factor_temperature" and (reach["temperature_degC"] or 0.0) > WARMED_DEGC:
+        told_by = "warm_rates"
     values = {name: None if size is None else float(f"{size:.2g}") for name, size in reach.items()}
     return {"code": f"untested.{told_by}", "values": values}
 
@@ -41,7 +45,7 @@ def why(row: Mapping[str, Any], reach: Mapping[str, Any]) -> Words:
 def reasons(candidates: Iterable[Mapping[str, Any]], reach: Mapping[str, Any]) -> list[Words]:
     """Each reason once, in the order of ``TOLD_BY``."""
     found = {said["code"]: said for said in (why(row, reach) for row in rows(candidates))}
-    order = [f"untested.{part}{name}" for name in (*TOLD_BY, "other") for part in ("no_", "")]
+    order = [f"untested.{part}{name}" for name in (*TOLD_BY, "warm_rates", "other") for part in ("no_", "")]
     return sorted(found.values(), key=lambda said: order.index(said["code"]))
 
 

@@ -27,6 +27,11 @@ Words = dict[str, Any]
 
 WARM = 3
 """So many recordings stay ready; one of 22 000 samples takes some 40 MB."""
+STILL_DPS, MOVED = 0.5, 0.05
+"""An axis that turned faster in less than this share of the time went to its zero, and stood still."""
+NAMED = 3
+"""So many effects that could not be tested are named in a headline; of more their number is told."""
+SURE = ("certain", "likely", "probable")
 PATH_HZ = 25.0
 """Fine enough to draw a motion of 4 Hz."""
 _warm: OrderedDict[tuple[Path, str, str, int], Workbench] = OrderedDict()
@@ -190,27 +195,43 @@ def _listed(
         row["tie"] = next((k for k, names in enumerate(ties) if name in names), None)
         row["in_model"], row["can_be_added"] = name in effects, name in possible
         row |= _evidence(row, threshold, tested, answer.get("reach"))
+        if row["tie"] is not None and row["word"] in SURE:
+            # Sure is that one of them is there, not which.
+            row |= {"code": "workbench.evidence.tied", "values": {}}
         row["sentence"] = render(row["code"], row["values"], lang)
         row["title"] = texts(lang).get(f"effects.{name}.name", name)
     order = sorted(
         rows.values(), key=lambda r: (not r["in_model"], r["status"] != "tested", -(r["z"] or 0.0), r["effect"])
     )
-    left = _untested_said(answer, lang)
+    left, headline = _untested_said(answer, lang), _headline(answer, lang)
     if effects:
         answer = answer | _beside_said(order, lang)
+        headline = answer["sentence"] if answer["values"] else ""
     verdict = {key: answer[key] for key in ("verdict", "sentence", "code", "values", "checks", "limits", "unknown")}
-    return dict(diagnosis.plain({**verdict, "threshold": threshold, "untested": left, "suspects": order}))
+    return dict(
+        diagnosis.plain({**verdict, "threshold": threshold, "headline": headline, "untested": left, "suspects": order})
+    )
+
+
+def _headline(answer: Words, lang: str) -> str:
+    """What is missing, in so few words that it can stand in large letters; empty where nothing is."""
+    code = "workbench.headline." + answer["code"].removeprefix("diagnosis.").replace("clipped", "missing")
+    return render(code, answer["values"], lang) if code in texts("en") else ""
 
 
 def _untested_said(answer: Words, lang: str) -> str:
     """What this recording could not test, and why; empty where it could test everything."""
     values = {name: answer["values"].get(name) for name in ("count", "why")}
-    return render("workbench.untested", values, lang) if values["why"] else ""
+    if not values["why"]:
+        return ""
+    names = [row["effect"] for row in untested.rows(answer["candidates"])]
+    values["effects"] = diagnosis.effect_words(names, "both")
+    return render("workbench.untested" if len(names) > NAMED else "workbench.untested_named", values, lang)
 
 
 def _beside_said(order: Sequence[Words], lang: str) -> Words:
     """What is to be said of a model with effects: whether anything stands out beside it."""
-    names = [row["effect"] for row in order if row["word"] in ("certain", "likely", "probable")]
+    names = [row["effect"] for row in order if row["word"] in SURE]
     code = "workbench.beside.something" if names else "workbench.beside.nothing"
     values = {"effects": diagnosis.effect_words(names[:3])} if names else {}
     return {"code": code, "values": values, "sentence": render(code, values, lang)}
@@ -233,13 +254,13 @@ def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], th
 
     ranked = bench.ranked(effects)
     for name, row in rows.items():
-        if name in ranked:
+        if name in ranked and not (row["status"] == "not_excited" and ranked[name][1] < threshold):
             gain, z = ranked[name]
             row |= {"two_delta_lnL": gain, "z": z, "p": p_value(z), "status": "tested"}
         elif name in bench.effects and row["status"] == "tested" and row["p"] is not None:
             # Its column is a mixture of those in the model.
             row |= {"two_delta_lnL": None, "z": None, "p": None, "status": "not_excited", "word": "spanned"}
-    over = [row for row in rows.values() if row["effect"] in ranked and row["z"] >= threshold]
+    over = [row for row in rows.values() if row["effect"] in ranked and (row["z"] or 0.0) >= threshold]
     best = max((row["two_delta_lnL"] for row in over), default=0.0)
     tied = [row["effect"] for row in over if best - row["two_delta_lnL"] < RIVAL]
     return [tied] if len(tied) > 1 else []
@@ -308,8 +329,10 @@ def _failures(model: Model, lang: str) -> list[Words]:
     from calib_core.gap_report import FAILING
 
     found = []
+    other = model.fitted.along.get("other_rate_dps")
+    still = other is not None and float(np.mean(np.abs(other) > STILL_DPS)) < MOVED
     for f in model.fitted.failures():
-        if abs(f.z) >= FAILING:
+        if abs(f.z) >= FAILING and not (still and f.covariate == "other_rate_dps"):
             told: Words = {
                 "covariate": f.covariate,
                 "from": f.low,

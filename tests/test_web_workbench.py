@@ -100,11 +100,14 @@ def test_an_example_opens_with_pictures_words_and_suspects(window: Window) -> No
     page = window.open("/workbench.html")
     page.click(".example:has-text('One sine')")
     page.wait_for_selector(".suspects .tied li:nth-child(2)", timeout=60_000)
-    assert "The model reads" in window.text(".says")
+    assert "Something is missing" in window.text(".says")
+    assert "The model reads" in window.text(".multiple.leads")
     assert page.locator(".multiple .u-wrap").count() >= 5
     assert page.locator(".multiple.failing .fails").count() >= 1
     assert "noise alone makes" in window.text("#floor")
     assert "cannot tell" in window.text(".verdict")
+    assert "Certain: one of these" in window.text(".suspects .tied")
+    assert "as well as the others" in window.text(".suspects .tied li:nth-child(2)")
     assert page.locator(".about svg").count() == 1
     assert page.locator(".suspects .no_data .add").count() == 0
 

@@ -60,6 +60,7 @@ class Suspect(Answer):
 class Suspects(Answer):
     verdict: str
     sentence: str
+    headline: str = Field(description="what is missing, in few words; empty where nothing is")
     untested: str = Field(description="what this recording could not test, and why; may be empty")
     threshold: float | None = Field(description="the z that noise alone reaches in one recording of a hundred")
     suspects: list[Suspect]

@@ -283,5 +283,8 @@ const tickWords = (ticks, isLog) => ticks.map((tick) => (tick == null ? "" : isL
 /** Decimals that the distance between ticks asks for. */
 function step(ticks) {
   const distance = ticks.length > 1 ? Math.abs(ticks[1] - ticks[0]) : 1;
-  return Math.max(0, -Math.floor(Math.log10(distance) + 1e-9));
+  const digits = Math.max(0, -Math.floor(Math.log10(distance) + 1e-9));
+  // A quarter takes one more: 1.75 is not 1.8.
+  const steps = distance * 10 ** digits;
+  return Math.abs(steps - Math.round(steps)) > 1e-6 ? digits + 1 : digits;
 }

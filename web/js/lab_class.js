@@ -8,6 +8,9 @@ import { duration, t, when } from "./text.js";
 
 const EVERY_MS = 5000;
 
+/** Nobody else reaches a server by these names. */
+const LOOPBACK = /^(localhost|127\.|\[?::1)/;
+
 export async function classroom(main, exercise, key) {
   const { code } = exercise;
   const { items: effects } = await api.effects();
@@ -56,7 +59,8 @@ export async function classroom(main, exercise, key) {
 
   main.append(
     h("header", { class: "stack" }, h("h1", {}, exercise.title || t("lab.bench", exercise)), state),
-    h("section", { class: "panel board-code" }, h("p", {}, t("lab.tell_students", { address: `${location.host}/lab.html` })), h("p", { class: "code" }, code)),
+    h("section", { class: "panel board-code" }, h("div", {}, h("p", {}, t("lab.tell_students", { address: `${location.host}/lab.html` })),
+      LOOPBACK.test(location.hostname) ? h("p", { class: "small muted" }, t("lab.this_computer")) : null), h("p", { class: "code" }, code)),
     h("section", { class: "panel stack" }, h("h2", {}, t("lab.results")), list, error,
       h("div", { class: "row" }, reveal,
         h("button", { type: "button", onclick: () => attempt(async () => save(await api.labTable(code, key), `lab-${code}.csv`)) }, t("lab.csv")),

@@ -10,6 +10,8 @@ import { notebook } from "./notebook.js";
 import { duration, t, when } from "./text.js";
 import { showCard } from "./workbench/card.js";
 
+const LOOK_MS = 5000;
+
 export async function hunt(main, exercise, student) {
   const { code, axis } = exercise;
   const { items: effects } = await api.effects();
@@ -62,7 +64,12 @@ export async function hunt(main, exercise, student) {
       form.replaceChildren(answerForm({
         code, effects, answer, runs,
         async onSubmit(given) {
-          student = await api.labAnswer(code, student.student, given);
+          try {
+            student = await api.labAnswer(code, student.student, given);
+          } catch (problem) {
+            if (problem.code === "lab.revealed") location.reload();
+            throw problem;
+          }
           show();
           pages.refresh();
           handed.scrollIntoView({ block: "nearest" });
@@ -72,6 +79,14 @@ export async function hunt(main, exercise, student) {
   }
   show();
   pages.panel(book);
+  // The teacher reveals when the class is ready: every page turns over by itself.
+  if (!exercise.revealed_at) {
+    const timer = setInterval(async () => {
+      if (document.hidden) return;
+      const now = await api.exercise(code).catch(() => null);
+      if (now?.revealed_at) { clearInterval(timer); location.reload(); }
+    }, LOOK_MS);
+  }
 }
 
 /** The truth, the answer with its marks, what the instrument makes of the same data, and the cards of what was hidden. */

@@ -47,6 +47,7 @@ async function open(main, recording, row, signal) {
     return stage && t(`workbench.stage.${stage}`);
   };
   const suspectsPlace = h("div", { class: "stack" }, waiting(t("workbench.looking"), progress));
+  cardPlace.append(h("p", { class: "muted" }, t("workbench.card.choose")));
   const byHand = h("div", {});
   suspectsPlace.append(byHand);
   const verdict = h("p", { class: "verdict" });
@@ -92,6 +93,7 @@ async function open(main, recording, row, signal) {
       if (known < 0) history.push(await fit(effects));
       at = known < 0 ? history.length - 1 : known;
       beside = null;
+      if (before && answer) draw.judge("", answer.untested);  // until the search has spoken of this model
       drawModel(performance.now() - began);
       if (before) {
         const more = effects.length > before.effects.length;
@@ -128,7 +130,11 @@ async function open(main, recording, row, signal) {
       refresh();
       // A search knows the noise better than the first fit did: what is shown is to say the same as the verdict.
       if (isFirst && at >= 0 && mine === judged && !signal.points) await again();
-    } catch (problem) { if (mine === judged) say(error, problem); }
+    } catch (problem) {
+      if (mine !== judged) return;
+      say(error, problem);
+      if (!answer) suspectsPlace.replaceChildren(h("p", { class: "error" }, problem.message), byHand);
+    }
   }
 
   /** The models tried so far, fitted anew. */
@@ -156,7 +162,7 @@ async function open(main, recording, row, signal) {
       return;
     }
     if (answer.verdict === "not_testable") { fail(answer.sentence); return; }
-    draw.limits(answer.untested);
+    draw.judge(answer.headline, answer.untested);
     next.label(answer);
     const hidden = isGuessing.checked && guess === null;
     draw.pointing(hidden);
@@ -226,7 +232,11 @@ async function open(main, recording, row, signal) {
       return (await lab(carried.lab)).run(experiment.next_experiment.motion, { joins: recording });
     },
     done(joined, told) {
-      if (!told) { location.href = links.workbench(joined, axis, carried); return; }
+      if (!told) {
+        const effects = history[at].effects.filter((name) => !own.has(name)).join();
+        location.href = links.workbench(joined, axis, { ...carried, ...(effects && { effects }) });
+        return;
+      }
       const { motion, duration_s } = told.experiment.next_experiment;
       book.write({ step: "experiment", motion, duration_s, recording: joined });
       if (told.diagnosis) book.write({ step: "verdict", code: told.diagnosis.code, values: told.diagnosis.values });
@@ -249,6 +259,9 @@ async function open(main, recording, row, signal) {
       judge([]);
       await Promise.all([library, change([])]);
       refresh();
+      // From the recording before this one, to which a motion was joined.
+      const kept = (asked.get("effects") ?? "").split(",").filter((name) => history[at]?.possible?.includes(name));
+      if (kept.length) await change(kept);
     } catch (problem) { say(error, problem); }
   })();
 }

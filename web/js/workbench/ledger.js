@@ -99,4 +99,4 @@ function parameterName(name, titles) {
 }
 
 const parameterTable = (parameters, titles) => table([t("result.parameter"), { n: t("result.value") }],
-  parameters.map((p) => [parameterName(p.name, titles), { n: written(p) }]), { compact: true, label: t("workbench.parameters") });
+  parameters.filter(({ name }) => !name.endsWith(".degree")).map((p) => [parameterName(p.name, titles), { n: written(p) }]), { compact: true, label: t("workbench.parameters") });

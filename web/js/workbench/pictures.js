@@ -26,7 +26,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
   let asking = 0;
   let compared = null;
   let isHiding = false;
-  let untested = null;
+  let judged = null;
 
   const overlay = chart(traces, {
     name: t("workbench.overlay"), group: GROUP, height: 200, x: time, y: { label: t(points ? "chart.gyro" : "chart.output"), unit, digits: points ? 3 : 4 },
@@ -92,10 +92,14 @@ export function pictures(place, { unit, points, detail, pointed }) {
     return largest > base / STEADY ? base : largest;
   }
 
+  /** One verdict leads: what the search says where it says that something is missing, else where the model fails. */
   function headline(failures) {
-    sentence.replaceChildren(isHiding ? t("workbench.guess.headline") : failures.length ? failures[0].sentence : t("workbench.fits"));
+    const said = (text) => h("span", { class: "limits" }, text);
+    if (isHiding) sentence.replaceChildren(t("workbench.guess.headline"));
+    else if (judged?.verdict) sentence.replaceChildren(said(judged.verdict));
+    else if (failures.length) sentence.replaceChildren(failures[0].sentence);
     // A fit that leaves nothing is read as "nothing is there": how far it holds belongs to it.
-    if (!isHiding && !failures.length) sentence.append(" ", h("span", { class: "limits" }, untested ?? t("workbench.untested_waiting")));
+    else sentence.replaceChildren(t("workbench.fits"), " ", said(judged ? judged.untested : t("workbench.untested_waiting")));
   }
 
   /** Everything of the model that is shown; in guessing without a word of where it fails. */
@@ -138,10 +142,10 @@ export function pictures(place, { unit, points, detail, pointed }) {
       drawSignal(fit);
       draw();
     },
-    /** What the recording could not test, in words. */
-    limits(text) {
-      untested = text;
-      if (shown) headline(isHiding ? [] : shown.failures);
+    /** The search's word on the model that is shown, empty where it misses nothing, and what it could not test. */
+    judge(verdict, untested) {
+      judged = { verdict, untested };
+      if (shown) headline(shown.failures);
     },
     /** Nothing can be said of it, and why: the signal stays, the places of what would be left of it go. */
     fail(text) {

@@ -54,7 +54,7 @@ export function showSuspects(place, answer, { open, toggle, decide, guess }) {
     const group = s.tie === null ? [s] : tied.get(s.tie);
     for (const one of group) drawn.add(one.effect);
     rows.push([group, group.length < 2 ? row(s)
-      : h("li", { class: "tied" }, h("div", { class: "row spread" }, h("p", { class: "small" }, t("workbench.tied")), decide && h("button", { type: "button", class: "add decide", onclick: decide }, t("workbench.decide"))), h("ul", {}, group.map(row)))]);
+      : h("li", { class: "tied" }, h("div", { class: "row spread" }, h("p", { class: "small" }, t(["certain", "likely", "probable"].includes(group[0].word) ? `workbench.tied_${group[0].word}` : "workbench.tied")), decide && h("button", { type: "button", class: "add decide", onclick: decide }, t("workbench.decide"))), h("ul", {}, group.map(row)))]);
   }
   const isFirst = ([group], k) => k < FEW || group.some((s) => s.in_model || !["nothing", "no_data", "not_excited", "spanned"].includes(s.word) || s.effect === guess);
   const first = rows.filter(isFirst);
