@@ -90,7 +90,7 @@ def error(window: Window) -> float:
 
 def add(page: Any, effect: str, steps: int) -> None:
     if not page.locator(f"[data-effect={effect}] .add").is_visible():
-        page.click(".list details summary")
+        page.click(".list details:not([open]) summary")
     page.click(f"[data-effect={effect}] .add")
     page.wait_for_selector(f".steps-bought li:nth-child({steps})")
     page.wait_for_selector(f"[data-effect={effect}].in_model")

@@ -59,8 +59,9 @@ export function showSuspects(place, answer, { open, toggle, decide, guess }) {
   const isFirst = ([group], k) => k < FEW || group.some((s) => s.in_model || !["nothing", "no_data", "not_excited", "spanned"].includes(s.word) || s.effect === guess);
   const first = rows.filter(isFirst);
   const rest = rows.filter((one, k) => !isFirst(one, k));
+  const wasOpen = place.querySelector("details")?.open ?? false;
   place.replaceChildren(
     h("ul", { class: "suspects" }, first.map(([, node]) => node)),
-    rest.length ? h("details", {}, h("summary", {}, t("workbench.all_effects", { count: suspects.length })), h("ul", { class: "suspects" }, rest.map(([, node]) => node))) : "",
+    rest.length ? h("details", { open: wasOpen }, h("summary", {}, t("workbench.all_effects", { count: suspects.length })), h("ul", { class: "suspects" }, rest.map(([, node]) => node))) : "",
     h("p", { class: "small muted" }, t("workbench.evidence_scale")));
 }
