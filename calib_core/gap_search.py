@@ -19,10 +19,10 @@ F64 = NDArray[np.float64]
 FALSE_ALARM = 0.01
 """Of a healthy record given anything at all; designing at 2 % fails a 2 % bar as often as not."""
 DRAWS = 4000
-SHARE, SHARE_RATE = 0.004, 0.04
+SHARE, SHARE_RATE = 0.002, 0.04
 """A new term must buy this share of what is explained already: the form of a big effect is never quite right, and a
 reference rate has errors that follow the motion."""
-REST = 0.1
+REST = 0.05
 """Or this share of what is left: then the form is not what is meant."""
 RIVAL = 6.0
 """2ΔlnL within which two explanations cannot be told apart."""
@@ -388,7 +388,7 @@ def _margin(best: Suspicion, other: Suspicion) -> float:
 def form(best: type[Effect], other: type[Effect], gain: float) -> float:
     """How much of the ``gain`` of ``best`` its form may owe to chance: forms are never quite right, but those of late
     answers, which are series in the same small number."""
-    return 0.0 if best.curvature is not None and other.curvature is not None else 0.5 * SHARE * gain
+    return 0.0 if best.curvature is not None and other.curvature is not None else SHARE * gain
 
 
 def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:
