@@ -76,6 +76,7 @@ def to_json(d: Diagnosis) -> dict[str, Any]:
         "after": {
             "effects": [*(t.name for t in d.asked), *(m["effect"] for m in missing)],
             "held_out_rms_dps": after.held_out_rms_dps,
+            "floor_rms_dps": after.floor_rms_dps,
             "parameters": parameters(d.after),
         },
         "reach": reach(space.covariates),

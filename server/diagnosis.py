@@ -207,7 +207,8 @@ def _verdict(answer: Words, tied: Mapping[str, list[str]]) -> Words:
 def errors(answer: Words) -> tuple[float, float, float, str]:
     """Held-out error of the model asked for and of the one with what it lacks, the noise's part, and their unit."""
     suffix, unit = ("deg", "deg") if "held_out_rms_deg" in answer["error"] else ("dps", "deg/s")
-    floor = answer["error"][f"floor_rms_{suffix}"]
+    # With what is missing the path is known better, and so is what noise alone makes.
+    floor = answer["after"].get(f"floor_rms_{suffix}", answer["error"][f"floor_rms_{suffix}"])
     found = (answer["error"][f"held_out_rms_{suffix}"], answer["after"][f"held_out_rms_{suffix}"], floor)
     before, after, floor = (rounded(x, 0.1 * floor) for x in found)
     return before, after, floor, unit
