@@ -96,7 +96,7 @@ export function pictures(place, { unit, points, detail, pointed }) {
   function headline(failures) {
     const said = (text) => h("span", { class: "limits" }, text);
     if (isHiding) sentence.replaceChildren(t("workbench.guess.headline"));
-    else if (judged?.verdict) sentence.replaceChildren(said(judged.verdict));
+    else if (judged?.verdict) sentence.replaceChildren(judged.verdict);
     else if (failures.length) sentence.replaceChildren(failures[0].sentence);
     // A fit that leaves nothing is read as "nothing is there": how far it holds belongs to it.
     else sentence.replaceChildren(t("workbench.fits"), " ", said(judged ? judged.untested : t("workbench.untested_waiting")));
