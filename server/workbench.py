@@ -250,17 +250,24 @@ def _found(answer: Words, rows: dict[str, Words]) -> list[list[str]]:
 def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], threshold: float) -> list[list[str]]:
     """Puts the evidence beside a model into the rows; gives the one tie of the best, if there is any."""
     from calib_core.gap import p_value
-    from calib_core.gap_search import RIVAL
+    from calib_core.gap_search import REST, RIVAL, SHARE, SHARE_RATE
 
-    ranked = bench.ranked(effects)
+    ranked, fitted = bench.ranked(effects), bench.fit(effects).fitted
+    # What the search would ask of one more effect, for the form of those in the model is never quite right.
+    rated = fitted.explanation.space.design.reference == "rate"
+    share = (SHARE_RATE if rated else SHARE) * fitted.two_delta_lnL
+    needed = share if rated else min(share, REST * fitted.explanation.chi2)
     for name, row in rows.items():
         if name in ranked and not (row["status"] == "not_excited" and ranked[name][1] < threshold):
             gain, z = ranked[name]
             row |= {"two_delta_lnL": gain, "z": z, "p": p_value(z), "status": "tested"}
+            if z >= threshold and gain < needed:
+                row["word"] = "form"
         elif name in bench.effects and row["status"] == "tested" and row["p"] is not None:
             # Its column is a mixture of those in the model.
             row |= {"two_delta_lnL": None, "z": None, "p": None, "status": "not_excited", "word": "spanned"}
-    over = [row for row in rows.values() if row["effect"] in ranked and (row["z"] or 0.0) >= threshold]
+    sure = [row for row in rows.values() if row["effect"] in ranked and row.get("word") != "form"]
+    over = [row for row in sure if (row["z"] or 0.0) >= threshold]
     best = max((row["two_delta_lnL"] for row in over), default=0.0)
     tied = [row["effect"] for row in over if best - row["two_delta_lnL"] < RIVAL]
     return [tied] if len(tied) > 1 else []
@@ -307,6 +314,8 @@ def _evidence(row: Mapping[str, Any], threshold: float, tested: int, reach: Mapp
         if reach and word in ("not_excited", "no_data") and row["effect"] not in untested.NEVER:
             values = {"why": untested.why(row, reach)}
             return {"word": word, "code": "workbench.evidence.untested", "values": values}
+    elif row.get("word") == "form":
+        word = "form"
     elif apart and not row["two_delta_lnL"]:
         return {"word": "nothing", "code": "workbench.evidence.by_itself", "values": {}}
     elif apart or row["z"] >= threshold:
