@@ -137,7 +137,7 @@ def test_rivals_share_a_tie_and_what_cannot_be_tested_says_so(stored: tuple[Path
     assert beside["time_offset"]["word"] in ("nothing", "spanned")
     # Whatever were asked of a bar, beside a large effect a little more is its form, and no finding.
     bench = workbench.warm(data, ids["one_sine"], "x")
-    assert workbench._beside(bench, ("bandwidth_lag",), rows := {n: dict(row) for n, row in rows.items()}, 0.5) == []
+    assert workbench._beside(bench, ("bandwidth_lag",), rows, 0.5) == []
     little = [row for row in rows.values() if row.get("word") == "form"]
     assert little
     assert {workbench._evidence(row | {"in_model": False}, 0.5, 20)["word"] for row in little} == {"form"}
