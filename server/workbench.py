@@ -200,8 +200,10 @@ def _listed(
             row |= {"code": "workbench.evidence.tied", "values": {}}
         row["sentence"] = render(row["code"], row["values"], lang)
         row["title"] = texts(lang).get(f"effects.{name}.name", name)
+    place = {name: k for k, name in enumerate(effects)}  # the model's own in the order in which they came
     order = sorted(
-        rows.values(), key=lambda r: (not r["in_model"], r["status"] != "tested", -(r["z"] or 0.0), r["effect"])
+        rows.values(),
+        key=lambda r: (place.get(r["effect"], len(place)), r["status"] != "tested", -(r["z"] or 0.0), r["effect"]),
     )
     left, headline = _untested_said(answer, lang), _headline(answer, lang)
     if effects:
