@@ -217,7 +217,7 @@ class Explanation:
         found = []
         for name, at in self.along().items():
             order = np.argsort(at, kind="stable")
-            if np.ptp(np.quantile(at, USUALLY)) <= HARDLY.get(name, 0.0) or len(order) < 2 * BINS:
+            if not varies(name, at) or len(order) < 2 * BINS:
                 continue
             parts = _stretches(at[order], order)
             if not parts:  # a short record, and most of it at one value
@@ -233,6 +233,11 @@ class Explanation:
             )
         # Whatever is slow is seen along time as well: time leads only where nothing else is nearly as plain.
         return sorted(found, key=lambda f: -abs(f.z) * (TIME_LEADS if f.covariate == "time_s" else 1.0))
+
+
+def varies(covariate: str, values: F64) -> bool:
+    """Whether anything can be seen along it: by more than its own noise, and not for a moment only."""
+    return bool(np.ptp(np.quantile(values, USUALLY)) > HARDLY.get(covariate, 0.0))
 
 
 def _stretches(values: F64, order: Ints) -> list[Ints]:

@@ -95,6 +95,7 @@ def fit(
 ) -> bytes:
     """Base and effects on a recording, with everything that a page draws of it; ``noise``: what a search found."""
     from calib_core import formula
+    from calib_core.gap_error import varies
     from calib_core.pictures import decimated, spectrum, stretches
 
     readings = _readings(data, recording)
@@ -118,7 +119,7 @@ def fit(
         "window_s": fitted.middle_s, "residual": fitted.residual_dps, "spread": fitted.spread_dps,
         "frequency_hz": f, "density": density,
     }  # fmt: skip
-    along = {name: values for name, values in fitted.along.items() if np.ptp(values) > 0.0}
+    along = {name: values for name, values in fitted.along.items() if varies(name, values)}
     for name, values in along.items():
         middle, mean, sigma = stretches(values, fitted.residual_dps, fitted.spread_dps)
         order = np.argsort(values, kind="stable")
