@@ -126,8 +126,8 @@ def test_a_model_that_explains_its_recording_says_what_was_not_tested_and_why() 
     error = {"held_out_rms_dps": 0.043, "floor_rms_dps": 0.0428}
     told = said(reach=reach, error=error, candidates=[*rows, {"effect": "bias_drift", "status": "tested"}])
     assert told["sentence"].endswith(
-        "Effects that it could not test: 3, because the temperature moved only by 0.021 °C, the supply was not recorded, "
-        "nothing turned faster than 47 deg/s."
+        "Effects that it could not test: 3, because the temperature moved only by 0.021 °C, the supply was not "
+        "recorded, nothing turned faster than 47 deg/s."
     )
     assert "could not" not in said(reach=reach, error=error, candidates=[rows[-1]])["sentence"]
 
