@@ -160,7 +160,7 @@ def test_from_the_teachers_form_to_the_table(server: Server, tmp_path: Path) -> 
         assert student.widest() <= PHONE["width"]
 
         page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # the teacher looks again
-        page.wait_for_selector("text=1 have joined, 1 have handed in")
+        page.wait_for_selector("text=Joined: 1. Handed in: 1.")
         assert page.locator(".mark").count() == 0, "marks before the reveal, where the class may look"
         page.click("text=Reveal the truth")
         page.click("text=Reveal now")

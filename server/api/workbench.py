@@ -163,8 +163,13 @@ async def suspects(
     return Suspects.model_validate(answer)
 
 
-@router.get("/recordings/{recording}/progress", summary="How far a search is that goes on for a recording")
+@router.get(
+    "/recordings/{recording}/progress",
+    summary="How far a search is that goes on for a recording",
+    responses=declared(404),
+)
 def progress(recording: str, axis: AxisName, here: Here) -> Progress:
+    here.store.recordings.row(recording)
     stage, seconds = here.searches.progress(recording, axis)
     return Progress.model_validate({"stage": stage, "seconds": seconds})
 
