@@ -9,7 +9,7 @@ from typing import Any
 # Before numpy is there: three processes with two BLAS threads each spin on two cores, and take twice as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import pytest  # noqa: E402
+import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
