@@ -36,16 +36,13 @@ def of(recording: Recording, axis: str, design: Design, bias: float, scale_facto
     if design.reference == "encoder":
         angle = _angle(recording, axis, s.time_s)
         slow = CROSSOVER_S / interval
-        rate = felt - _smooth(felt, slow) + np.gradient(_smooth(angle, slow), interval)
-        rate = np.convolve(np.pad(rate, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        rate = _crossed(felt, angle, CROSSOVER_S, interval)
         position = np.concatenate([[0.0], np.cumsum(felt[1:] + felt[:-1])]) * interval / 2.0
         position += _smooth(angle - position, slow)
         still = design.averages.at[design.averages.at >= 0]
         rate[still] = 0.0
         # The encoder's own jump at a reversal, smoothed, would move the moment at which the table seems to turn.
-        slow = BACKGROUND_S / interval
-        turning = felt - _smooth(felt, slow) + np.gradient(_smooth(angle, slow), interval)
-        turning = np.convolve(np.pad(turning, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
+        turning = _crossed(felt, angle, BACKGROUND_S, interval)
         turning[still] = 0.0
     else:
         reference = recording.reference_rate(axis)
@@ -118,6 +115,13 @@ def direction(rate_dps: F64) -> F64:
             share = -rate_dps[j] / (rate_dps[j + 1] - rate_dps[j]) if rate_dps[j] else 0.5
             out[j if share < 0.5 else j + 1] += now * (1.0 - 2.0 * share)
     return out
+
+
+def _crossed(felt: F64, angle: F64, crossover_s: float, interval_s: float) -> F64:
+    """(k,) the rate, its part faster than ``crossover_s`` the gyro's and the rest the encoder's; a mean over three."""
+    sigma = crossover_s / interval_s
+    rate = felt - _smooth(felt, sigma) + np.gradient(_smooth(angle, sigma), interval_s)
+    return np.convolve(np.pad(rate, 1, mode="edge"), np.full(3, 1 / 3), mode="valid")
 
 
 def _angle(recording: Recording, axis: str, at_s: F64) -> F64:

@@ -248,9 +248,7 @@ class Search:
             ):
                 del rivals[0]
             rest = self.chi2(self.chosen)
-            explained = self.chi2([]) - rest
-            rated = self.space.design.reference == "rate"
-            needed = SHARE_RATE * explained if rated else min(SHARE * explained, REST * rest)
+            needed = asked(self.space, self.chi2([]) - rest, rest)
             if not rivals or self._beside_refined(rivals[0].term, rest) < needed:
                 return
             simplest = min((s for s in rivals if rivals[0].gain - s.gain < 1.0), key=lambda s: len(s.term.setting))
@@ -377,6 +375,13 @@ class Search:
             for k, term in enumerate(self.chosen):
                 if term.effect.nonlinear() or term.effect.curvature is not None:
                     self.chosen[k], _ = self.refined(term, [*self.chosen[:k], *self.chosen[k + 1 :]])
+
+
+def asked(space: Space, explained: float, rest: float) -> float:
+    """χ² that one more effect must take off the ``rest`` where a model has ``explained`` so much."""
+    if space.design.reference == "rate":
+        return SHARE_RATE * explained
+    return min(SHARE * explained, REST * rest)
 
 
 def _margin(best: Suspicion, other: Suspicion) -> float:

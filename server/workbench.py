@@ -253,13 +253,11 @@ def _found(answer: Words, rows: dict[str, Words]) -> list[list[str]]:
 def _beside(bench: Workbench, effects: Sequence[str], rows: dict[str, Words], threshold: float) -> list[list[str]]:
     """Puts the evidence beside a model into the rows; gives the one tie of the best, if there is any."""
     from calib_core.gap import p_value
-    from calib_core.gap_search import REST, RIVAL, SHARE, SHARE_RATE
+    from calib_core.gap_search import RIVAL, asked
 
     ranked, fitted = bench.ranked(effects), bench.fit(effects).fitted
     # What the search would ask of one more effect, for the form of those in the model is never quite right.
-    rated = fitted.explanation.space.design.reference == "rate"
-    share = (SHARE_RATE if rated else SHARE) * fitted.two_delta_lnL
-    needed = share if rated else min(share, REST * fitted.explanation.chi2)
+    needed = asked(fitted.explanation.space, fitted.two_delta_lnL, fitted.explanation.chi2)
     for name, row in rows.items():
         if name in ranked and not (row["status"] == "not_excited" and ranked[name][1] < threshold):
             gain, z = ranked[name]
