@@ -162,7 +162,7 @@ def _tries(hand: Hand, effect: type[Effect], own: Sequence[Setting]) -> list[Set
         top = float(np.abs(c.rate_dps).max())
         limits = [values[0] + abs(values[1]) * top * part for part in np.linspace(0.5, 1.5, CLIPS)]
         return [*own, *((2.0 * values[0] - limit, limit) for limit in limits)]
-    if effect.curvature is not None or not effect.nonlinear():
+    if effect.about or not effect.nonlinear():
         return list(own) or [()]
     if effect.name == "bias_step":
         return [*own, *settings(effect, hand.space)]

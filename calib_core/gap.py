@@ -34,6 +34,8 @@ FORM = 0.03
 the error of a reference rate."""
 CLEAR = 25.0
 """Of χ², what a limit must take away: samples have been sought that it suits."""
+PASSES = 2
+"""So often shapes are made again at the rate without what is large; a third time changes nothing that is seen."""
 AGREED = 2.0
 """Of χ² on data not seen, what an effect must take away."""
 BY_ITSELF = ("saturation", "adc_quantization", "mains_hum", "bias_random_walk", "input_loading")
@@ -151,14 +153,53 @@ def prepare(recording: Recording, axis: str, mask: NDArray[np.bool_] | None = No
     design = Design.of(recording, axis, mask)
     rough = design.rough()
     scale_factor = float(rough[1]) if len(rough) > 1 else float("nan")
-    c = covariates.of(recording, axis, design, float(rough[0]), scale_factor)
-    space = Space(design, c, rough)
-    if len(values := space.values) > 1:
+    space = Space(design, covariates.of(recording, axis, design, float(rough[0]), scale_factor), rough)
+    if len(space.values) > 1:
         # The base is now known well: the covariates, and the space about them, once more.
-        del space, c
-        space = Space(design, covariates.of(recording, axis, design, *values.tolist()), values)
+        about = _about(recording, space)
+        del space  # a long record has no room for two
+        space = about()
     design.averages.forget()
     return space
+
+
+def begin(
+    recording: Recording,
+    axis: str,
+    pool: dict[str, type[Effect]],
+    rng: np.random.Generator,
+    mask: NDArray[np.bool_] | None = None,
+) -> Search:
+    """A search of the recording's space, for what of ``pool`` has a shape in it.
+
+    An effect that is large bends the rate that the gyro tells, on which every shape depends: it is taken out of it
+    first (METHOD 2: shapes at the model-corrected true rate).
+    """
+    space = prepare(recording, axis, mask)
+    shaped = {n: e for n, e in pool.items() if n not in BY_ITSELF and not e.missing(space.covariates)}
+    search = Search(space, shaped, rng)
+    for _ in range(PASSES if space.design.reference == "encoder" and space.design.moves else 0):
+        large = search.large()
+        if not large:
+            break
+        about = _about(recording, search.space, large)
+        del space, search, large
+        space = about()
+        search = Search(space, shaped, rng)
+        space.design.averages.forget()
+    return search
+
+
+def _about(recording: Recording, space: Space, terms: Sequence[Term] = ()) -> Callable[[], Space]:
+    """What makes the space once more, with covariates for its own base and without what ``terms`` bring into them."""
+    values, shift_dps, shown_deg = space.brought(terms)
+    axis, design, noise, (bias, scale_factor) = space.covariates.axis, space.given, space.noise, values.tolist()
+
+    def made() -> Space:
+        c = covariates.of(recording, axis, design, bias, scale_factor, shift_dps=shift_dps, shown_deg=shown_deg)
+        return Space(design, c, values, settled=bool(terms), guess=noise)
+
+    return made
 
 
 def _search(
@@ -170,15 +211,12 @@ def _search(
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Space, Search]:
     """The space of the recording, and a search of it that has the asked effects in its model."""
-    space = prepare(recording, axis, mask)
-    c = space.covariates
-    shaped = {n: e for n, e in pool.items() if n not in BY_ITSELF and not e.missing(c)}
-    search = Search(space, shaped, rng)
+    search = begin(recording, axis, pool, rng, mask)
     if effects:
         first = [next((t for t in search.terms() if t.name == name), None) or _refuse(name) for name in effects]
-        search = Search(space, shaped, rng, chosen=first, columns=search.columns)
+        search = Search(search.space, search.suspects, rng, chosen=first, columns=search.columns)
         search.settle()
-    return space, search
+    return search.space, search
 
 
 def _refuse(name: str) -> Term:
@@ -199,16 +237,40 @@ def _clipped(
     if clip is None:
         return space, search
     kept, without = _search(recording, answer.axis, pool, effects, rng, ~clip.clipped)
-    space.use_noise(kept.noise)
-    everything = search.chi2(search.chosen)
-    _, ranking = search.scan()
-    other = min((search.refined(s.term, search.chosen)[1] for s in ranking[:3]), default=everything)
-    inside = len(space.rows) - len(kept.rows)
-    clipped = without.chi2(without.chosen) + inside
-    if clipped > min(other, everything - CLEAR):
+    gain = clip_gain(search, without)
+    if gain is None:
         return space, search
-    answer.clip, answer.clip_gain = clip, everything - clipped
+    answer.clip, answer.clip_gain = clip, gain
     return kept, without
+
+
+def clip_gain(search: Search, without: Search) -> float | None:
+    """2ΔlnL of a limit, from the whole record and the one ``without`` what is on it; None where another effect serves
+    as well. Of both the chosen are kept, and the noise that is left at last is that of the samples on no limit."""
+    space = search.space
+    own, inside = space.noise, len(space.rows) - len(without.space.rows)
+    without.prepare()
+    # Samples on a limit must not pass for noise.
+    space.use_noise(without.space.noise)
+    everything, (best, other) = search.chi2(search.chosen), _best(search)
+    clipped = without.chi2(without.chosen) + inside
+    if clipped <= min(other, everything - CLEAR):
+        return everything - clipped
+    # Beside an effect larger than the limit: does it serve better there than any other second one?
+    if best is not None:
+        beside = Search(space, search.suspects, search.rng, [*search.chosen, best], columns=search.columns)
+        clipped = _best(without)[1] + inside
+        if clipped <= min(_best(beside)[1], other - CLEAR):
+            return other - clipped
+    space.use_noise(own)
+    return None
+
+
+def _best(search: Search) -> tuple[Term | None, float]:
+    """The effect that leaves least beside what is chosen, and the χ² it leaves."""
+    _, ranking = search.scan()
+    refined = [search.refined(s.term, search.chosen) for s in ranking[:3]]
+    return min(refined, key=lambda found: found[1], default=(None, search.chi2(search.chosen)))
 
 
 def _sought(search: Search) -> None:

@@ -183,7 +183,7 @@ def parameters(explanation: Explanation) -> list[dict[str, Any]]:
     scaled = space.scale_factor / (space.scale_factor + float(values[1])) if len(space.values) > 1 else 1.0
     for term in explanation.terms:
         own = term.effect.parameters()
-        as_made = term.effect.acts is Acts.OUTPUT or term.effect.curvature is not None
+        as_made = term.effect.acts is Acts.OUTPUT or term.effect.about
         for k, name in enumerate(term.names):
             if name:
                 u, share = spread[at + k], 1.0 if as_made or known[at + k] else scaled

@@ -28,6 +28,8 @@ TOP, PLAIN = 4, 60.0
 """Beside an exact rate: so large a part of the samples may be on a limit, which must explain so much."""
 SETTLED = 3.0
 """So many deviations of the smoothing after a change."""
+APART_DPS = 3.0
+"""Slower rates belong to neither half of the line."""
 SMOOTH_S, STEADY_DPS2, STEADY_S = 0.06, 150.0, 0.1
 """Where the rate changes faster, or the output moves within this time, the smoothed encoder is behind."""
 
@@ -74,8 +76,9 @@ def find(recording: Recording, axis: str, design: Design, noise: float) -> Clip 
         inner = settled
     if reach < 20.0 * noise or inner.sum() < FEWEST or np.ptp(rate[inner]) == 0.0:
         return None
-    fit = np.polynomial.Polynomial.fit(rate[inner], s.output[inner], 1)
-    expected = fit(rate)
+    # A dead band or play shifts the line apart at zero: its two halves need not meet.
+    line = np.column_stack([np.ones(len(rate)), rate, np.sign(rate) * (np.abs(rate) > APART_DPS)])
+    expected = line @ np.linalg.lstsq(line[inner], s.output[inner], rcond=None)[0]
     spread = float(np.std(s.output[inner] - expected[inner]))
     limits: dict[float, float] = {}
     clipped = np.zeros(len(s.output), bool)

@@ -37,6 +37,8 @@ FIELD = 8
 LATE_TURNS = 6
 PLAIN = 8.0
 """|z| of what is refined before the noise is estimated."""
+LARGE = 1000.0
+"""Of χ², what an effect explains that bends the rate by more than the noise does."""
 NOISE_COMPANY = 8
 """So many best classes stand in the model while the noise is estimated."""
 
@@ -177,8 +179,8 @@ class Search:
 
     def refined(self, term: Term, others: Sequence[Term], kept: Collection[str] = ()) -> tuple[Term, float]:
         """``term`` at the best setting of its nonlinear parameters, but those ``kept``, beside ``others``; the χ²."""
-        if term.effect.curvature is not None:
-            return (term, self.chi2([*others, term])) if kept else self._refined_late(term, others)
+        if term.effect.about:
+            return (term, self.chi2([*others, term])) if kept else self._refined_about(term, others)
         from scipy.optimize import minimize_scalar
 
         best, low = term, self.chi2([*others, term])
@@ -215,7 +217,7 @@ class Search:
         best = max(range(len(z)), key=z.__getitem__)
         return tried[best], chi2[best]
 
-    def _refined_late(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
+    def _refined_about(self, term: Term, others: Sequence[Term]) -> tuple[Term, float]:
         for _ in range(LATE_TURNS):
             tau = self.value(term, others)
             if term.name == "angular_acceleration":
@@ -229,6 +231,21 @@ class Search:
         """The coefficient of ``term``'s one column beside ``others``."""
         gram, free = self._free([*others, term])
         return float(gram.coefficients(free)[0][-1])
+
+    def large(self) -> list[Term]:
+        """The two best effects at most, as far as they explain much."""
+        found: list[Term] = []
+        ranking = self.scan()[1]
+        if not ranking or ranking[0].z < PLAIN:
+            return found
+        trial = Search(self.space, self.suspects, self.rng, columns=self.columns)
+        for _ in range(2):
+            field = trial._field(trial.prepare())
+            if not field or field[0].gain < LARGE:
+                break
+            trial.chosen.append(field[0].term)
+            trial.settle()
+        return trial.chosen
 
     def run(self, most: int = MOST) -> None:
         """Adds effects one by one while the best passes the threshold and buys its share; fills ``findings``."""
@@ -373,7 +390,7 @@ class Search:
         """Refines the nonlinear parameters of all chosen terms beside each other."""
         if len(self.chosen) > 1:
             for k, term in enumerate(self.chosen):
-                if term.effect.nonlinear() or term.effect.curvature is not None:
+                if term.effect.nonlinear() or term.effect.about:
                     self.chosen[k], _ = self.refined(term, [*self.chosen[:k], *self.chosen[k + 1 :]])
 
 
@@ -386,7 +403,7 @@ def asked(space: Space, explained: float, rest: float) -> float:
 
 def _margin(best: Suspicion, other: Suspicion) -> float:
     """2ΔlnL within which ``other`` serves as well as the ``best``; a step is at the best of many places."""
-    tuned = best.term.effect.nonlinear() and best.term.effect.curvature is None
+    tuned = best.term.effect.nonlinear()
     return RIVAL + form(best.term.effect, other.term.effect, best.gain) + (TUNED if tuned else 0.0)
 
 

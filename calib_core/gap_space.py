@@ -78,6 +78,12 @@ class Space:
     covariates: Covariates
     values: F64
     """(b,) bias and, where something moved, scale factor."""
+    settled: bool = field(default=False, kw_only=True)
+    """Whether the values are already those of a good model: then they are kept."""
+    guess: NoiseFit | None = field(default=None, kw_only=True)
+    """The noise to begin with, where it was found already."""
+    given: Design = field(init=False)
+    """The design as it was given; in ``design`` readings that recur count as one."""
     rows: Rows = field(init=False)
     """The design's, condensed: (n,) of them."""
     base: F64 = field(init=False)
@@ -92,7 +98,7 @@ class Space:
     whitener: Whitener = field(init=False)
 
     def __post_init__(self) -> None:
-        design = self.design
+        design = self.given = self.design
         if design.readings is not None:
             # A motion that repeats the same codes does not average their error: each counts as one.
             variance = design.rows.reading_variance * design.readings.recurrence
@@ -127,8 +133,11 @@ class Space:
         self._last: RowNoise | None = None  # coloured noise as it was found last
         self._listed: tuple[Term, ...] = ()
         self._places: dict[int, list[int]] = {}
-        self.refit_noise([])
-        for _ in range(2):
+        if self.guess is None:
+            self.refit_noise([])
+        else:
+            self.use_noise(self.guess)
+        for _ in range(0 if self.settled else 2):
             step, _ = self.gram([]).coefficients([])
             self.values = self.values + step[: len(self.values)]
             self.use_noise(self.noise)
@@ -225,10 +234,38 @@ class Space:
                 shapes = self._answered(effect, setting[0] if setting else 0.0)
                 return (("",) * (shapes.shape[1] - 1)) + effect.linear(), Acts.RATE, shapes
             return effect.linear(), Acts.ANGLE, self._late(effect, setting)
+        if effect.about and setting:
+            return ("", *effect.linear()), *self._retimed(setting[0])
         # Nothing is remembered from one look to the next: each begins settled, as the recording does.
         begun = replace(self.covariates, memory={})
         named = effect.columns(begun, **dict(zip(effect.nonlinear(), setting, strict=True)))
         return tuple(named), effect.acts, np.column_stack([*named.values()])
+
+    def brought(self, terms: Sequence[Term]) -> tuple[F64, F64, F64]:
+        """Fitted with ``terms``: bias and scale factor; (k,) deg/s that the terms bring into the measured rate at the
+        samples; (k,) deg that they bring into the encoder's angle."""
+        k, gram = len(self.covariates.time_s) if terms else 1, self.gram(terms)
+        names = [name for t in terms for name in t.names]
+        fixed = [i for i, name in enumerate(names, 1 + gram.base) if not name]
+        free = [i for i, name in enumerate(names, 1 + gram.base) if name]
+        found = gram.known(dict.fromkeys(fixed, 1.0)).coefficients(free)[0]
+        sizes = np.ones(len(names))
+        sizes[[i - 1 - gram.base for i in free]] = found[gram.base :]
+        base = self.values + found[: len(self.values)]
+        rate, angle = np.zeros(k), np.zeros(k)
+        for term in terms:
+            own, sizes = sizes[: len(term.names)], sizes[len(term.names) :]
+            acts, shapes = self.shapes(term)
+            shape = shapes @ own
+            if acts is Acts.ANGLE and term.effect.about:
+                # In truth it is the gyro that is late, not the encoder that is early.
+                rate -= np.gradient(shape, self.covariates.interval_s)
+            elif acts is Acts.ANGLE:
+                angle += shape
+            else:
+                # Sizes are those beside the scale factor that the columns were made with.
+                rate += shape * (self.scale_factor if acts is Acts.RATE else 1.0) / base[1]
+        return base, rate, angle
 
     def over_rows(self, acts: Acts, shapes: F64 | Operator) -> F64:
         """(n, p) in the unit of the output, from shapes (k, p) at the samples in what the effect acts on."""
@@ -292,6 +329,30 @@ class Space:
         little = 0.02 * abs(tau)
         change = (answer(tau + little) - answer(tau - little)) / (2.0 * little)
         return np.column_stack([answer(tau) - c.rate_dps - tau * change, change])
+
+    def _retimed(self, skew: float) -> tuple[Acts, F64]:
+        """(k, 2) about a clock that runs ahead by ``skew``: what that adds by itself, and how it changes."""
+        from scipy.interpolate import CubicSpline
+
+        c = self.covariates
+        begin, end = c.time_s[0], c.time_s[-1]
+        if self.design.readings is None:
+
+            def answer(skew: float) -> F64:
+                return self._curve(c.time_s * (1.0 - skew)) - c.rate_dps
+        else:
+            turned = np.concatenate([[0.0], np.cumsum(self.felt[1:] + self.felt[:-1])]) * c.interval_s / 2.0
+            angle = CubicSpline(c.time_s, turned)
+
+            def answer(skew: float) -> F64:
+                """What the encoder is ahead of the gyro's integral W: (1 - s)·W(t/(1 - s)) - W(t)."""
+                at = np.clip(c.time_s / (1.0 - skew), begin, end)
+                return np.asarray((1.0 - skew) * angle(at) - turned)
+
+        little = max(0.02 * abs(skew), 1e-9)
+        change = (answer(skew + little) - answer(skew - little)) / (2.0 * little)
+        shapes = np.column_stack([answer(skew) - skew * change, change])
+        return (Acts.RATE if self.design.readings is None else Acts.ANGLE), shapes
 
     @cached_property
     def _curve(self) -> Callable[[F64], F64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib_core import covariates
 from calib_core.effects.base import Acts, Covariates, Effect
+from calib_core.effects.clock_skew import ClockSkew
 from calib_core.effects.saturation import Saturation
 from calib_core.excitation import Excitation, commanded, steps, warming
 from calib_core.gap_space import Space, Term
@@ -80,6 +81,11 @@ class Prospect(Space):
         names, acts, shapes = super()._shapes(effect, setting)
         self.covariates = own
         return names, acts, shapes[-k:]
+
+    def _retimed(self, skew: float) -> tuple[Acts, F64]:  # noqa: ARG002
+        """To first order: what is imagined is known no better."""
+        change = ClockSkew.columns(self.covariates)["skew"]
+        return Acts.RATE, np.column_stack([np.zeros_like(change), change])
 
 
 def clipping(space: Space, setting: Sequence[float]) -> Term:

@@ -95,22 +95,16 @@ class Workbench:
     @cached_property
     def _parts(self) -> tuple[Workspace, Workspace | None, gap_saturation.Clip | None]:
         """All samples; those that are on no limit, and the limits, where these explain more than any other effect."""
-        space = gap.prepare(self.recording, self.axis)
-        clip = gap_saturation.find(self.recording, self.axis, space.design, space.rough_noise)
-        whole = _workspace(space)
+        rng = np.random.default_rng(0)
+        whole = gap.begin(self.recording, self.axis, library(), rng)
+        clip = gap_saturation.find(self.recording, self.axis, whole.space.design, whole.space.rough_noise)
+        made = Workspace(whole)
         if clip is None:
-            return whole, None, None
-        kept = _workspace(gap.prepare(self.recording, self.axis, ~clip.clipped))
-        own_noise = space.noise
-        # Samples on a limit must not pass for noise.
-        space.use_noise(kept.space.noise)
-        base = whole.fit()
-        rivals = [whole.fit([name]) for name in list(whole.gains(base))[:3]]
-        inside = len(space.rows) - len(kept.space.rows)
-        if kept.fit().explanation.chi2 + inside < min(f.explanation.chi2 for f in (base, *rivals)):
-            return whole, kept, clip
-        space.use_noise(own_noise)
-        return whole, None, None
+            return made, None, None
+        kept = gap.begin(self.recording, self.axis, library(), rng, ~clip.clipped)
+        if gap.clip_gain(whole, kept) is None:
+            return made, None, None
+        return made, Workspace(kept), clip
 
     @property
     def _whole(self) -> Workspace:
@@ -170,8 +164,3 @@ class Workbench:
         freedom = {name: max(1, len(effect.linear())) for name, effect in {**library(), **self._own}.items()}
         gains = workspace.gains(model.fitted)
         return {name: (gain, float(equivalent_z(gain, freedom[name]))) for name, gain in gains.items()}
-
-
-def _workspace(space: Space) -> Workspace:
-    shaped = {n: e for n, e in library().items() if n not in gap.BY_ITSELF and not e.missing(space.covariates)}
-    return Workspace(space, shaped)

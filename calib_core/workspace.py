@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects import Effect, library
-from calib_core.gap import BY_ITSELF, prepare
+from calib_core.gap import begin
 from calib_core.gap_error import Error, Explanation, Failure
 from calib_core.gap_report import parameters
 from calib_core.gap_search import Search
-from calib_core.gap_space import Space, Term
+from calib_core.gap_space import Term
 from calib_core.problem import Problem
 from calib_core.recording import Recording
 
@@ -77,18 +77,15 @@ class Fitted:
 class Workspace:
     """Rows, noise and columns of one axis. The noise is that of base and best suspects, whatever is tried."""
 
-    def __init__(self, space: Space, suspects: Mapping[str, type[Effect]]) -> None:
-        self.space = space
-        self._search = Search(space, dict(suspects), np.random.default_rng(0))
-        self._search.prepare()
+    def __init__(self, search: Search) -> None:
+        self.space, self._search = search.space, search
+        search.prepare()
 
     @classmethod
     def of(cls, recording: Recording, axis: str, suspects: Mapping[str, type[Effect]] | None = None) -> Workspace:
         """Raises Problem for an axis that is not there, without a reference, too short or stuck."""
-        space = prepare(recording, axis)
-        pool = library() if suspects is None else suspects
-        usable = {n: e for n, e in pool.items() if n not in BY_ITSELF and not e.missing(space.covariates)}
-        return cls(space, usable)
+        pool = library() if suspects is None else dict(suspects)
+        return cls(begin(recording, axis, pool, np.random.default_rng(0)))
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -133,7 +130,7 @@ class Workspace:
             search.chosen.append(self._first(search, name, fixed))
         for _ in range(2 if len(effects) > 1 else 1):
             for k, term in enumerate(search.chosen):
-                if term.effect.curvature is not None or set(term.effect.nonlinear()) - _own(fixed, term):
+                if term.effect.about or set(term.effect.nonlinear()) - _own(fixed, term):
                     others = [*search.chosen[:k], *search.chosen[k + 1 :]]
                     search.chosen[k], _ = search.refined(term, others, _own(fixed, term))
         explanation = Explanation(self.space, search.chosen, fixed)
@@ -150,7 +147,7 @@ class Workspace:
         """The effect where it does best on its grid, beside those before it; where fixed, there."""
         effect = search.suspects[name]
         given = {k: fixed[f"{name}.{p}"] for k, p in enumerate(effect.nonlinear()) if f"{name}.{p}" in fixed}
-        if effect.curvature is not None and f"{name}.{effect.linear()[0]}" in fixed:
+        if effect.about and f"{name}.{effect.linear()[0]}" in fixed:
             return self.space.term(effect, [fixed[f"{name}.{effect.linear()[0]}"]])
         grid = search.columns[name]
         if given:

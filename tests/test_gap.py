@@ -13,6 +13,7 @@ from calib_core.gap import Diagnosis, diagnose, named
 from calib_core.gap_report import _ties, to_json
 from calib_core.recording import Recording
 from server.bench import gap_records
+from server.bench.gap_campaign import true_floor
 
 
 def made(seed: int, effects: dict[str, float], **options: object) -> Recording:
@@ -93,6 +94,23 @@ def test_what_has_no_name_does_not_pass_for_noise(effect: str, along: str) -> No
 def test_two_effects_are_both_found() -> None:
     diagnosis = diagnose(made(9, {"bias_temperature": 1.0, "scale_factor_asymmetry": 1.0}), "x")
     assert {"bias_temperature", "scale_factor_asymmetry"} <= told(diagnosis)
+
+
+@pytest.mark.parametrize(
+    ("effects", "plan"),
+    [
+        ({"dead_band": 1.4, "saturation": 1.2}, "second"),
+        ({"angular_acceleration": 1.3, "saturation": 0.85}, "second"),
+        ({"dead_band": 1.0, "clock_skew": 1.3}, "first"),
+    ],
+)
+def test_a_large_effect_does_not_bend_the_shape_of_another(effects: dict[str, float], plan: str) -> None:
+    truth = gap_records.record(23, effects, plan=plan, locked=True)
+    diagnosis = diagnose(made(23, effects, plan=plan, locked=True), "x")
+    assert told(diagnosis) >= set(effects)
+    assert diagnosis.verdict in ("missing", "ambiguous")
+    assert diagnosis.after is not None
+    assert diagnosis.after.error().held_out_rms_dps < 1.1 * true_floor(truth)
 
 
 def test_a_second_look_at_a_time_constant_begins_settled_too() -> None:

@@ -15,7 +15,7 @@ class BandwidthLag(Effect):
     """
 
     name, stage, acts = "bandwidth_lag", Stage.SENSOR, Acts.RATE
-    positive, curvature = True, 0.0
+    positive, curvature, about = True, 0.0, True
     tau = Param("s", 6e-3, (0.0, 0.2))
 
     @classmethod

@@ -14,7 +14,7 @@ class ClockSkew(Effect):
     Source:        METHOD 4
     """
 
-    name, stage, acts = "clock_skew", Stage.ACQUISITION, Acts.RATE
+    name, stage, acts, about = "clock_skew", Stage.ACQUISITION, Acts.RATE, True
     skew = Param("1", 2e-5, (-1e-2, 1e-2))
 
     @classmethod
