@@ -24,7 +24,6 @@ from calib_core.gap_spikes import spikes
 from calib_core.gap_unknown import CERTAIN, Structure, strongest
 from calib_core.gap_wander import Walk, wandering
 from calib_core.integral_fit import Design
-from calib_core.problem import Problem
 from calib_core.recording import Recording
 
 F64 = NDArray[np.float64]
@@ -213,14 +212,8 @@ def _search(
     """The space of the recording, and a search of it that has the asked effects in its model."""
     search = begin(recording, axis, pool, rng, mask)
     if effects:
-        first = [next((t for t in search.terms() if t.name == name), None) or _refuse(name) for name in effects]
-        search = Search(search.space, search.suspects, rng, chosen=first, columns=search.columns)
-        search.settle()
+        search = Search(search.space, search.suspects, rng, chosen=search.placed(effects), columns=search.columns)
     return search.space, search
-
-
-def _refuse(name: str) -> Term:
-    raise Problem("diagnosis.effect_not_possible", effect=name)
 
 
 def _clipped(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib_core.effects.base import Effect
 from calib_core.gap_gram import Gram
 from calib_core.gap_space import Space, Term
+from calib_core.problem import Problem
 
 F64 = NDArray[np.float64]
 
@@ -34,7 +35,7 @@ CLEAN = 1e-3
 """Of a column's square, what must be its own to stand beside others while the noise is estimated."""
 FIELD = 8
 """So many classes are refined before one is chosen."""
-LATE_TURNS = 6
+LATE_TURNS, TURNS = 6, 3
 PLAIN = 8.0
 """|z| of what is refined before the noise is estimated."""
 LARGE = 1000.0
@@ -231,6 +232,23 @@ class Search:
         """The coefficient of ``term``'s one column beside ``others``."""
         gram, free = self._free([*others, term])
         return float(gram.coefficients(free)[0][-1])
+
+    def placed(self, effects: Sequence[str]) -> list[Term]:
+        """The terms of ``effects`` where they do best together, in the noise that they leave.
+
+        Raises Problem diagnosis.effect_not_possible for one that is not among the suspects.
+        """
+        self.terms()
+        placed: list[Term] = []
+        for name in effects:
+            if name not in self.columns:
+                raise Problem("diagnosis.effect_not_possible", effect=name)
+            placed.append(min(self.columns[name], key=lambda t: self.chi2([*placed, t])))
+        for _ in range(TURNS):
+            self.space.refit_noise(placed)
+            for k, term in enumerate(placed):
+                placed[k] = self.refined(term, [*placed[:k], *placed[k + 1 :]])[0]
+        return placed
 
     def large(self) -> list[Term]:
         """The two best effects at most, as far as they explain much."""

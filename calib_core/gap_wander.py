@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_core.effects.base import Acts
-from calib_core.gap_search import RIVAL, TUNED, Search
+from calib_core.gap_search import RIVAL, Search
 from calib_core.gap_space import Space, Term
 from calib_core.gap_unknown import Unknown
 
@@ -28,8 +28,10 @@ NEAR_LIMIT = 0.5
 FASTEST_S, MOST = 4.0, 60
 """The series ends at half waves of this length: what is faster is noise."""
 STRONG, FORM = 300.0, 0.3
-EVIDENCE = 16.0
-"""2ΔlnL over noise that does not wander."""
+EVIDENCE, AT_LIMIT = 16.0, 6.0
+"""2ΔlnL over noise that does not wander; over noise that is as slow as it may be, which wanders in all but name."""
+WORTH = 6.0
+"""2ΔlnL that each size and setting of a slow shape gains by standing where it does best."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,19 @@ def wandering(search: Search) -> Walk | None:
     deviance = np.array([_deviance(search, kept, waves, math.exp(u) * deviations) for u in size])
     best = int(np.argmin(deviance))
     # Noise that would be slower if it could speaks for the walk itself.
-    margin = 0.0 if noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * space.noise.longest_s else RIVAL
+    slowest = noise.ar1 > 0.0 and noise.correlation_time_s >= 0.99 * space.noise.longest_s
+    margin = 0.0 if slowest else RIVAL
     # Of what strong slow shapes explain, a share is always their form, which a walk mends without being one.
     margin += FORM * max(plain - now - STRONG, 0.0)
     gain = now - float(deviance[best]) - margin
-    # A walk's waves are weighed with all their sizes, shapes are at their best: so much is each of theirs worth.
+    # A walk's waves are weighed with all their sizes, shapes are at their best.
     fitted = sum(t.freedom + len(t.setting) for t in slow)
-    near = bool(slow) and abs(gain + margin) < RIVAL + TUNED * fitted
-    if deviance[best] > plain - EVIDENCE or not (gain > 0.0 or near) or not 0 < best < len(size) - 1:
+    near = bool(slow) and abs(gain + margin) < RIVAL + WORTH * fitted
+    if (
+        deviance[best] > plain - (AT_LIMIT if slowest else EVIDENCE)
+        or not (gain > 0.0 or near)
+        or not 0 < best < len(size) - 1
+    ):
         space.use_noise(was)
         return None
     if gain <= 0.0:

@@ -43,7 +43,7 @@ def run(*, quick: bool) -> Iterator[Row]:
 
 def part(first: int = 0, count: int | None = None, *, quick: bool = False) -> Iterator[Row]:
     """The table of ``count`` cases of each of the four groups (all), beginning with number ``first``."""
-    groups = {name: cases[first:][:count] for name, cases in _cases(20, 2).items()}
+    groups = {name: cases[first:][:count] for name, cases in _cases(40, 4).items()}
     if quick:
         groups = {name: groups[name] for name in ("white", "one, white")}
     tools: dict[str, Select | None] = {
