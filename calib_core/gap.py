@@ -6,6 +6,7 @@ not seen. Everything is told by codes and values; sentences are made where a lan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -253,7 +254,8 @@ def clip_gain(search: Search, without: Search) -> float | None:
     if best is not None:
         beside = Search(space, search.suspects, search.rng, [*search.chosen, best], columns=search.columns)
         clipped = _best(without)[1] + inside
-        if clipped <= min(_best(beside)[1], other - CLEAR):
+        # Rows are formed anew where samples are left out: others, with a χ² of their own.
+        if clipped <= min(_best(beside)[1], other - CLEAR - 4.0 * math.sqrt(len(space.rows))):
             return other - clipped
     space.use_noise(own)
     return None
