@@ -139,7 +139,10 @@ def direction(rate_dps: F64) -> F64:
     passes zero); the sample next to that moment has what a straight line through its neighbours needs for the step to
     be there.
     """
-    scatter = float(np.median(np.abs(np.diff(rate_dps, 3)))) / (0.6745 * 2.0) if len(rate_dps) > 3 else 0.0
+    bend = np.abs(np.diff(rate_dps, 3))
+    # In rests the rate is zero without noise; means over three have third differences of twice their deviation.
+    bend = bend[bend > 0.0]
+    scatter = float(np.median(bend)) / (0.6745 * 2.0) if len(bend) else 0.0
     turning = float(np.clip(PLAIN * scatter, LEAST_DPS, TURNING_DPS))
     still = STILL * turning
     sign = np.where(rate_dps > turning, 1.0, np.where(rate_dps < -turning, -1.0, 0.0))

@@ -17,6 +17,16 @@ def test_after_a_rest_the_reversal_is_where_motion_began_and_not_where_noise_cro
     assert np.all(found[180:] == -1.0)
 
 
+def test_where_the_table_mostly_rests_noise_beside_a_rest_is_no_motion() -> None:
+    rng = np.random.default_rng(5)
+    rate = np.zeros(2000)
+    rate[100:150], rate[1000:1050] = 20.0, 20.0
+    noise = 0.2 * np.convolve(rng.standard_normal(2000), np.full(3, 1 / 3), mode="same")
+    near = (np.arange(2000) % 200) < 60
+    found = covariates.direction(rate + np.where(near, noise, 0.0))
+    assert np.all(found[100:] == 1.0)
+
+
 def test_a_reversal_in_motion_is_where_the_rate_passed_zero() -> None:
     time = np.arange(0.0, 8.0, 0.01)
     found = covariates.direction(40.0 * np.cos(2.0 * np.pi * 0.25 * time))

@@ -67,7 +67,7 @@ def table(rows: Sequence[Row]) -> str:
     cells = [
         (
             row.name,
-            f"{row.figure:.3g} {row.unit}".rstrip(),
+            f"{row.figure:.4g} {row.unit}".rstrip(),
             "" if row.limit is None else f"{'≥' if row.at_least else '≤'} {row.limit:g}",
             "" if row.limit is None else "ok" if row.ok else "MISSED",
             " against ".join(filter(None, (row.ours, row.theirs))),

@@ -40,6 +40,19 @@ def _plain(seed: int, options: tuple[tuple[str, Any], ...]) -> Record:
 
 def evidence(seed: int, effects: Mapping[str, float], options: Mapping[str, Any]) -> float:
     """√NCP of all that the effects do to output and encoder and that bias and scale factor do not explain."""
+    left = _left(seed, effects, options)
+    return float(np.sqrt(left @ left))
+
+
+def apart(seed: int, truth: str, rival: str, strength: float, options: Mapping[str, Any]) -> float:
+    """√NCP of what ``truth`` does and ``rival``, of whatever size, does not do."""
+    left, other = (_left(seed, {name: strength}, options) for name in (truth, rival))
+    left = left - other * float(left @ other) / float(other @ other)
+    return float(np.sqrt(left @ left))
+
+
+def _left(seed: int, effects: Mapping[str, float], options: Mapping[str, Any]) -> F64:
+    """(n,) whitened: what the effects do and bias and scale factor do not explain."""
     made, plain = record(seed, effects, **options), _plain(seed, tuple(options.items()))
     scale = float(str(made.truth["scale_factor_V_per_dps"]))
     axis = made.truth["axis"]
@@ -55,8 +68,7 @@ def evidence(seed: int, effects: Mapping[str, float], options: Mapping[str, Any]
         base = (np.ones(len(clean)), np.gradient(encoder_plain, INTERVAL_S))
         columns = np.column_stack([clean - clean_plain, *base])
         shape = _on_the_encoder(columns, encoder - encoder_plain, codes, *noise)
-    left = shape[:, 0] - shape[:, 1:] @ np.linalg.lstsq(shape[:, 1:], shape[:, 0], rcond=None)[0]
-    return float(np.sqrt(left @ left))
+    return np.asarray(shape[:, 0] - shape[:, 1:] @ np.linalg.lstsq(shape[:, 1:], shape[:, 0], rcond=None)[0])
 
 
 def whitened(values: F64, white: float, ar1: float, phi: float) -> F64:
