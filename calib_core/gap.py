@@ -18,7 +18,7 @@ from calib_core import contest, covariates, gap_saturation
 from calib_core.effects import Effect, library
 from calib_core.gap_checks import Check, checks
 from calib_core.gap_error import Explanation
-from calib_core.gap_search import SHARE, Search, Suspicion
+from calib_core.gap_search import FORM, Search, Suspicion
 from calib_core.gap_space import Space, Term
 from calib_core.gap_spectrum import Hum, find_hum
 from calib_core.gap_spikes import spikes
@@ -29,9 +29,8 @@ from calib_core.recording import Recording
 
 F64 = NDArray[np.float64]
 
-FORM = 0.03
-"""Structure that explains less than this share of what has a name is the name's form, which is never quite right, or
-the error of a reference rate."""
+FORM_RATE = 0.03
+"""Beside a reference rate structure that explains less than this share of what has a name is the rate's own error."""
 CLEAR = 25.0
 """Of χ², what a limit must take away: samples have been sought that it suits."""
 PASSES = 2
@@ -307,7 +306,7 @@ def _structure(answer: Diagnosis, search: Search) -> None:
     """Flags what no library effect explains; names that do not pass beside it are dropped."""
     explained = search.chi2([]) - search.chi2(search.chosen)
     found = strongest(search.space, search.chosen)
-    form = SHARE if search.space.design.reference == "encoder" else FORM
+    form = FORM if search.space.design.reference == "encoder" else FORM_RATE
     if found is None or found.z < CERTAIN or found.gain < form * explained:
         return
     answer.unknown = found

@@ -19,7 +19,7 @@ from calib_core.effects import Acts, Covariates, Effect, library
 from calib_core.formula import UserEffect
 from calib_core.gap import p_value
 from calib_core.gap_checks import Check
-from calib_core.gap_search import FALSE_ALARM, RIVAL, SHARE
+from calib_core.gap_search import FALSE_ALARM, FORM, RIVAL
 from calib_core.points import Points
 from calib_core.problem import Problem
 
@@ -257,7 +257,7 @@ def _search(
             return chosen, gains
         best = max(field, key=field.__getitem__)
         column = next(c for c in free if c.name == best)
-        bought = field[best] >= SHARE * len(readings.gyro) * np.log(first / readings.fit(chosen).squares)
+        bought = field[best] >= FORM * len(readings.gyro) * np.log(first / readings.fit(chosen).squares)
         judged = readings.at_other_places if gains else readings.held_out
         holds = judged([*chosen, column]) < judged(chosen)
         if field[best] < null_tail(readings.own(free, chosen), rng) ** 2 or not (bought and holds):

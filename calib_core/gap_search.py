@@ -20,7 +20,9 @@ F64 = NDArray[np.float64]
 FALSE_ALARM = 0.01
 """Of a healthy record given anything at all; designing at 2 % fails a 2 % bar as often as not."""
 DRAWS = 4000
-SHARE, SHARE_RATE = 0.002, 0.04
+FORM = 0.002
+"""Share of what an effect explains that may be its form's, which is never quite right."""
+SHARE, SHARE_RATE = 0.001, 0.04
 """A new term must buy this share of what is explained already: the form of a big effect is never quite right, and a
 reference rate has errors that follow the motion."""
 REST = 0.05
@@ -298,7 +300,12 @@ class Search:
         if ranking and ranking[0].z > PLAIN:
             # What is not quite its shape would pose as noise.
             company = [self.refined(t, self.chosen)[0] if t is ranking[0].term else t for t in company]
-        self.space.refit_noise([*self.chosen, *company])
+        # Nor are the chosen ones' times right until all stand beside them.
+        chosen = list(self.chosen)
+        for k, term in enumerate(chosen):
+            if term.effect.nonlinear():
+                chosen[k] = self.refined(term, [*chosen[:k], *chosen[k + 1 :], *company])[0]
+        self.space.refit_noise([*chosen, *company])
         return self.scan()[1]
 
     def _field(self, ranking: Sequence[Suspicion]) -> list[Suspicion]:
@@ -428,7 +435,7 @@ def _margin(best: Suspicion, other: Suspicion) -> float:
 def form(best: type[Effect], other: type[Effect], gain: float) -> float:
     """How much of the ``gain`` of ``best`` its form may owe to chance: forms are never quite right, but those of late
     answers, which are series in the same small number."""
-    return 0.0 if best.curvature is not None and other.curvature is not None else SHARE * gain
+    return 0.0 if best.curvature is not None and other.curvature is not None else FORM * gain
 
 
 def settings(effect: type[Effect], space: Space) -> list[tuple[float, ...]]:

@@ -299,12 +299,14 @@ class Space:
         )
 
     def _late(self, effect: type[Effect], setting: Sequence[float]) -> F64:
-        """A late answer in terms of the measured rate w: the angle lags by w + κτ·w'; τ is the setting."""
+        """A late answer in terms of the measured rate w: the angle lags by w + κτ·w' + κ₃τ²·w''; τ is the setting."""
         assert effect.curvature is not None
         tau = setting[0] if setting else 0.0
         shape = self.felt
         if tau:
-            shape = shape + effect.curvature * tau * np.gradient(shape, self.covariates.interval_s)
+            slope = np.gradient(shape, self.covariates.interval_s)
+            bend = np.gradient(slope, self.covariates.interval_s)
+            shape = shape + effect.curvature * tau * slope + effect.third * tau**2 * bend
         sign = -1.0 if effect.name == "angular_acceleration" else 1.0
         return sign * shape[:, None]
 

@@ -158,6 +158,14 @@ def test_a_walk_and_shapes_that_serve_as_well_are_told_as_rivals_or_as_sets() ->
     assert _ties(answer) == {"rivals": [["bias_random_walk", "bias_step"]], "rival_sets": [alternatives[1]]}
 
 
+def test_an_asked_effect_is_fitted_with_its_time_constant_too() -> None:
+    search = diagnose(made(12, {"warm_up": 1.0}), "x", effects=("warm_up",)).search
+    assert search is not None
+    (term,) = search.chosen
+    shorter, longer = (search.space.term(term.effect, (term.setting[0] * factor,)) for factor in (0.8, 1.25))
+    assert search.chi2([term]) < min(search.chi2([shorter]), search.chi2([longer]))
+
+
 def test_asked_effects_stand_in_the_model_and_are_not_missing() -> None:
     answer = to_json(diagnose(made(11, {"scale_factor_cubic": 0.6}), "x", effects=["scale_factor_cubic"]))
     assert answer["model"]["effects"] == ["scale_factor_cubic"]

@@ -15,7 +15,7 @@ class AngularAcceleration(Effect):
     """
 
     name, stage, acts, needs = "angular_acceleration", Stage.SENSOR, Acts.RATE, ()
-    curvature, about = 1.0, True
+    curvature, third, about = 1.0, 1.0, True
     k = Param("s", 6e-3, (-0.2, 0.2))
 
     @classmethod

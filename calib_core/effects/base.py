@@ -118,6 +118,8 @@ class Effect:
     """Whether the linear parameter can only be positive."""
     curvature: ClassVar[float | None] = None
     """κ of a late answer: in terms of the measured rate w the loss is τ·w' + κ·τ²·w'' (METHOD 2)."""
+    third: ClassVar[float] = 0.0
+    """And that of the next order: what multiplies τ³."""
     about: ClassVar[bool] = False
     """Whether the one linear parameter is refined by columns about its value: to first order is not enough."""
 

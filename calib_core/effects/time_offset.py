@@ -17,7 +17,7 @@ class TimeOffset(Effect):
     """
 
     name, stage, acts = "time_offset", Stage.ACQUISITION, Acts.RATE
-    curvature, about = 0.5, True
+    curvature, third, about = 0.5, 1.0 / 6.0, True
     delay = Param("s", 6e-3, (-0.2, 0.2))
 
     @classmethod
