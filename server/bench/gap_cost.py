@@ -58,8 +58,9 @@ def _scored(samples: int) -> Iterator[Row]:
         from sklearn.model_selection import GroupKFold, cross_val_score
 
         folds = Folds.of(time_s)
+        groups, parts = folds.of_time(time_s), GroupKFold(len(folds))
         score = cross_val_score(
-            LinearRegression(), columns[:, pairs[0]], columns[:, 0], groups=folds.of_time(time_s), cv=GroupKFold(len(folds)),
+            LinearRegression(), columns[:, pairs[0]], columns[:, 0], groups=groups, cv=parts,
             scoring="neg_mean_squared_error",
         )  # fmt: skip
         found["theirs"] = float(score.mean())
