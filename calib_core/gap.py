@@ -270,6 +270,8 @@ def _best(search: Search) -> tuple[Term | None, float]:
 def _sought(search: Search) -> None:
     """Adds what is missing, and takes away what does not hold."""
     search.run()
+    if search.split():
+        search.run()
     search.merge()
     if len(search.chosen) - search.given > 1:
         search.exchange()

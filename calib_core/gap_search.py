@@ -38,6 +38,8 @@ CLEAN = 1e-3
 FIELD = 8
 """So many classes are refined before one is chosen."""
 LATE_TURNS, TURNS = 6, 3
+SETTLED, PAIRED = 3, 6
+"""So many rivals are looked at with the others where they would stand then; of so many classes pairs are tried."""
 PLAIN = 8.0
 """|z| of what is refined before the noise is estimated."""
 LARGE = 1000.0
@@ -301,11 +303,7 @@ class Search:
             # What is not quite its shape would pose as noise.
             company = [self.refined(t, self.chosen)[0] if t is ranking[0].term else t for t in company]
         # Nor are the chosen ones' times right until all stand beside them.
-        chosen = list(self.chosen)
-        for k, term in enumerate(chosen):
-            if term.effect.nonlinear():
-                chosen[k] = self.refined(term, [*chosen[:k], *chosen[k + 1 :], *company])[0]
-        self.space.refit_noise([*chosen, *company])
+        self.space.refit_noise([*self._settled(self.chosen, company), *company])
         return self.scan()[1]
 
     def _field(self, ranking: Sequence[Suspicion]) -> list[Suspicion]:
@@ -335,7 +333,31 @@ class Search:
                 z = float(equivalent_z(best.gain, best.term.freedom))
                 self.chosen[k] = best.term
                 self.findings[k - self.given].chosen = Suspicion(best.term, best.gain, z)
+                self.settle()
                 return
+
+    def split(self) -> bool:
+        """Puts two effects in the place of one that passed for both, where that buys what a second effect must."""
+        for k in range(self.given, len(self.chosen) if len(self.chosen) - self.given < MOST else 0):
+            others, now = [*self.chosen[:k], *self.chosen[k + 1 :]], self.chi2(self.chosen)
+            trial = Search(self.space, self.suspects, self.rng, chosen=others, columns=self.columns)
+            ranking = [s for s in trial.scan()[1] if s.term.name != self.chosen[k].name][:PAIRED]
+            pairs = [(self.chi2([*others, a.term, b.term]), a, b) for a, b in combinations(ranking, 2)]
+            if not pairs:
+                continue
+            _, a, b = min(pairs, key=lambda pair: pair[0])
+            both = self._settled([*others, a.term, b.term])
+            left = self.chi2(both)
+            found = []
+            for one in both[-2:]:
+                gain = self.chi2([t for t in both if t is not one]) - left
+                found.append(Suspicion(one, gain, float(equivalent_z(gain, one.freedom))))
+            if min(equivalent_z(now - left, 1), *(s.z for s in found)) > self.threshold:
+                self.chosen = both
+                del self.findings[k - self.given]
+                self.findings += [Finding(s, [s], self.threshold) for s in found]
+                return True
+        return False
 
     def rivals(self) -> list[list[Suspicion]]:
         """For each chosen effect, every effect that would serve in its place, the others kept: itself first or near."""
@@ -346,9 +368,13 @@ class Search:
             trial = Search(self.space, self.suspects, self.rng, chosen=others, columns=self.columns)
             _, ranking = trial.scan()
             field = [Suspicion(term, now - self.chi2([*others, term]), 0.0)]
-            for s in ranking[:8]:
-                if s.term.name != term.name and s.z > 0.5 * ranking[0].z:
+            for place, s in enumerate(ranking[:8]):
+                # Beside the first few the others may stand elsewhere, however little is left for them where they are.
+                near = bool(others) and place <= SETTLED
+                if s.term.name != term.name and (near or s.z > 0.5 * ranking[0].z):
                     other, chi2 = self.refined(s.term, others)
+                    if near:
+                        chi2 = min(chi2, self.chi2(self._settled([*others, other])))
                     if not (other.effect.positive and self.value(other, others) < 0.0):
                         field.append(Suspicion(other, now - chi2, 0.0))
             field.sort(key=lambda s: -s.gain)
@@ -414,9 +440,21 @@ class Search:
     def settle(self) -> None:
         """Refines the nonlinear parameters of all chosen terms beside each other."""
         if len(self.chosen) > 1:
-            for k, term in enumerate(self.chosen):
-                if term.effect.nonlinear() or term.effect.about:
-                    self.chosen[k], _ = self.refined(term, [*self.chosen[:k], *self.chosen[k + 1 :]])
+            self.chosen = self._settled(self.chosen)
+
+    def _settled(self, terms: Sequence[Term], company: Sequence[Term] = ()) -> list[Term]:
+        """``terms`` where they do best beside each other and ``company``: anywhere on the grid, then refined."""
+        settled = list(terms)
+        for k, term in enumerate(settled):
+            if not (term.effect.nonlinear() or term.effect.about):
+                continue
+            others = [*settled[:k], *settled[k + 1 :], *company]
+            if term.effect.nonlinear():
+                now = self.chi2([*others, term])
+                best = min(self.columns.get(term.name, []), key=lambda t: self.chi2([*others, t]), default=term)
+                term = best if self.chi2([*others, best]) < now - 1.0 else term
+            settled[k] = self.refined(term, others)[0]
+        return settled
 
 
 def asked(space: Space, explained: float, rest: float) -> float:

@@ -25,7 +25,7 @@ from server.bench.gap_oracle import detectable, evidence
 from server.bench.gap_records import EFFECTS, OUTSIDE_THE_LIBRARY, Record, record
 
 PROCESSES = 2
-SEED = 20261126
+SEED = 20261127
 INSIDE = tuple(name for name in EFFECTS if name not in OUTSIDE_THE_LIBRARY)
 LATE = ("bandwidth_lag", "time_offset", "angular_acceleration", "clock_skew")
 NO_SHAPE = ("adc_quantization", "bias_random_walk")
