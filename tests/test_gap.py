@@ -113,6 +113,27 @@ def test_a_large_effect_does_not_bend_the_shape_of_another(effects: dict[str, fl
     assert diagnosis.after.error().held_out_rms_dps < 1.1 * true_floor(truth)
 
 
+@pytest.mark.parametrize(
+    ("seed", "effects", "options"),
+    [
+        (30009515, {"bias_temperature": 1.335, "bias_step": 1.078}, {}),
+        (
+            763985777,
+            {"bias_drift": 1.306, "bias_temperature": 0.807},
+            {"locked": True, "ar1_V": 1.906e-4, "phi": 0.99356},
+        ),
+        (2713465319, {"thermal_lag": 1.197, "bias_temperature": 1.365}, {"locked": True}),
+    ],
+)
+def test_of_slow_effects_the_first_to_be_seen_does_not_stand_in_for_two(
+    seed: int, effects: dict[str, float], options: dict[str, object]
+) -> None:
+    diagnosis = diagnose(made(seed, effects, plan="second", **options), "x")
+    assert told(diagnosis) >= set(effects)
+    assert diagnosis.verdict in ("missing", "ambiguous")
+    assert diagnosis.walk is None
+
+
 def test_a_second_look_at_a_time_constant_begins_settled_too() -> None:
     space = gap.prepare(made(7, {}), "x")
     looks = [space.term(library()["thermal_lag"], (40.0,)).columns for _ in range(2)]
