@@ -20,6 +20,8 @@ GUESSES = [(0.95, 0.05), (0.95, 0.3), (0.95, 2.0), (0.8, 0.05), (0.8, 0.3), (0.8
 """White noise's share, and the correlation time of the rest: the slower, the less of it is plain to see."""
 ALIKE = 1e-11
 """What is added to squares, so that columns as good as alike once they are whitened do no harm."""
+SPANNED = 1e-7
+"""Of a column, what must be its own."""
 IMPOSSIBLE = 1e12
 """In place of a -2lnL that cannot be had."""
 ENOUGH = 0.02
@@ -83,8 +85,7 @@ def fit_noise(
         begin = np.linspace(0, n - BLOCK, MAX_ROWS // BLOCK).astype(int)
         chosen = np.unique((begin[:, None] + np.arange(BLOCK)).ravel())
         rows, y, columns = rows.take(chosen), y[chosen], columns[chosen]
-    columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
-    both = np.column_stack([columns / np.sqrt((columns**2).mean(axis=0)), y])
+    both = np.column_stack([_apart(columns), y])
 
     alike = ALIKE * np.eye(both.shape[1])
 
@@ -140,6 +141,14 @@ def first_guess(rows: Rows, y: F64) -> float:
     return max(float(np.std(np.diff(chosen, 3))) / math.sqrt(20.0), 1e-12)
 
 
+def _apart(columns: F64) -> F64:
+    """(n, q) of mean square one, that span what ``columns`` (n, p) do: powers of one temperature are nearly alike."""
+    columns = columns[:, np.abs(columns).max(axis=0) > 0.0]
+    q, r = np.linalg.qr(columns / np.sqrt((columns**2).mean(axis=0)))
+    size = np.abs(np.diag(r))
+    return np.asarray(q[:, size > SPANNED * size.max(initial=0.0)] * np.sqrt(len(q)))
+
+
 def _covariance(curvature: F64) -> F64:
     return np.asarray(2.0 * np.linalg.inv(curvature))
 
@@ -159,7 +168,7 @@ def _minimise(function: Callable[[F64], float], x: F64) -> tuple[F64, float, F64
         power, vectors = np.linalg.eigh(hessian)
         power = np.maximum(np.abs(power), 1e-3)
         step = -vectors @ ((vectors.T @ (up - down)) / (2.0 * h * power))
-        step *= min(1.0, 1.5 / float(np.abs(step).max()))
+        step *= min(1.0, 1.5 / max(float(np.abs(step).max()), 1e-300))
         while (after := function(x + step)) > value and np.abs(step).max() > 1e-3:
             step /= 3.0
         if after <= value:

@@ -103,3 +103,11 @@ def test_a_real_chamber_record_is_given_no_trap_and_its_last_leg_is_predicted(
     assert said.after is not None
     assert [t.name for t in said.after.terms] == names
     assert gap_real.error(said, said.after, whole, axis, ~seen) < most_dps
+
+
+def test_powers_of_one_temperature_asked_for_by_hand_are_fitted_beside_slow_noise() -> None:
+    shared("real/thermal_chamber.csv")
+    whole = gap_real.read_named("thermal_chamber")
+    said = diagnose(whole.take(whole.time_s <= gap_real.TURNED_S), "x", effects=["bias_temperature"])
+    assert said.after is not None
+    assert [t.setting for t in said.after.terms][:1] == [(3.0,)]
