@@ -194,7 +194,7 @@ def _slow(recording: Recording, name: str, index: NDArray[np.int64], interval_s:
         return None
     whole = np.interp(np.arange(len(values)), known, values[known])
     smooth = _smooth(whole, COVARIATE_S / interval_s)
-    # What smoothing took off slow swings is put back, smoothed: a twentieth of one of 5 s is left out, not a fifth.
+    # What smoothing took off slow swings is put back, smoothed: a thirtieth of one of 5 s is lost, not a fifth.
     return smooth + _smooth(whole - smooth, COVARIATE_S / interval_s)
 
 

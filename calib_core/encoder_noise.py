@@ -56,9 +56,10 @@ def step_of(angle_deg: F64) -> float:
     gaps = np.diff(levels)
     if len(gaps) == 0:
         return 0.0
-    step = float(gaps.min())
+    # Printed angles are rounded: the smallest gap is off by that, the mean of such gaps by little, and the slope over
+    # all codes by nothing.
+    step = float(gaps[gaps < 1.5 * gaps.min()].mean())
     for _ in range(3):
-        # Printed angles are rounded: the smallest gap is off by that, the slope over all codes is not.
         codes = np.round((levels - levels[0]) / step)
         step = float(codes @ (levels - levels[0]) / (codes @ codes))
     off_grid = np.abs(levels - levels[0] - step * codes).max()

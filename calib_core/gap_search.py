@@ -256,10 +256,9 @@ class Search:
 
     def large(self) -> list[Term]:
         """The two best effects at most, as far as they explain much."""
-        found: list[Term] = []
         ranking = self.scan()[1]
         if not ranking or ranking[0].z < PLAIN:
-            return found
+            return []
         trial = Search(self.space, self.suspects, self.rng, columns=self.columns)
         for _ in range(2):
             field = trial._field(trial.prepare())

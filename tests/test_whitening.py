@@ -117,6 +117,8 @@ def test_encoder_step_is_found_and_printed_digits_are_not_taken_for_one() -> Non
     smooth = np.round(30.0 * np.sin(np.arange(2000) * 0.0157), 4)
     codes = np.round(np.round(smooth / STEP_DEG) * STEP_DEG, 4)
     assert encoder_noise.step_of(codes) == pytest.approx(STEP_DEG, rel=1e-5)
+    printed = np.array([float(f"{angle:.3g}" if abs(angle) < 1.0 else f"{angle:.4g}") for angle in codes])
+    assert encoder_noise.step_of(printed) == pytest.approx(STEP_DEG, rel=1e-4)
     assert encoder_noise.step_of(smooth) == 0.0
     assert encoder_noise.step_of(np.full(50, 3.2)) == 0.0
 
