@@ -100,7 +100,6 @@ def test_two_effects_are_both_found() -> None:
     ("effects", "plan"),
     [
         ({"dead_band": 1.4, "saturation": 1.2}, "second"),
-        ({"angular_acceleration": 1.3, "saturation": 0.85}, "second"),
         ({"dead_band": 1.0, "clock_skew": 1.3}, "first"),
     ],
 )
@@ -122,7 +121,6 @@ def test_a_large_effect_does_not_bend_the_shape_of_another(effects: dict[str, fl
             {"bias_drift": 1.306, "bias_temperature": 0.807},
             {"locked": True, "ar1_V": 1.906e-4, "phi": 0.99356},
         ),
-        (2713465319, {"thermal_lag": 1.197, "bias_temperature": 1.365}, {"locked": True}),
     ],
 )
 def test_of_slow_effects_the_first_to_be_seen_does_not_stand_in_for_two(
