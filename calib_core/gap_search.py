@@ -162,7 +162,7 @@ class Search:
 
     def chi2(self, terms: Sequence[Term]) -> float:
         """χ² of the record under base and ``terms``."""
-        gram, free = self._free(terms)
+        gram, free = self.space.free(terms)
         return gram.chi2(free)
 
     def deviance(self, terms: Sequence[Term]) -> float:
@@ -171,16 +171,8 @@ class Search:
 
     def held_out(self, terms: Sequence[Term]) -> float:
         """χ² of what base and ``terms`` leave of each fold, fitted to the others."""
-        gram, free = self._free(terms, folds=True)
+        gram, free = self.space.free(terms, folds=True)
         return gram.left_out(free)[0]
-
-    def _free(self, terms: Sequence[Term], *, folds: bool = False) -> tuple[Gram, list[int]]:
-        """The terms' Gram matrix, and which of its columns have a coefficient that is not known to be one."""
-        gram = self.space.gram(terms, folds=folds)
-        named = [name for t in terms for name in t.names]
-        fixed = [k for k, name in enumerate(named, 1 + gram.base) if not name]
-        free = [k for k, name in enumerate(named, 1 + gram.base) if name]
-        return (gram.known(dict.fromkeys(fixed, 1.0)) if fixed else gram), free
 
     def refined(self, term: Term, others: Sequence[Term], kept: Collection[str] = ()) -> tuple[Term, float]:
         """``term`` at the best setting of its nonlinear parameters, but those ``kept``, beside ``others``; the χ²."""
@@ -234,7 +226,7 @@ class Search:
 
     def value(self, term: Term, others: Sequence[Term]) -> float:
         """The coefficient of ``term``'s one column beside ``others``."""
-        gram, free = self._free([*others, term])
+        gram, free = self.space.free([*others, term])
         return float(gram.coefficients(free)[0][-1])
 
     def placed(self, effects: Sequence[str]) -> list[Term]:

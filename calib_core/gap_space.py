@@ -244,12 +244,9 @@ class Space:
     def brought(self, terms: Sequence[Term]) -> tuple[F64, F64, F64]:
         """Fitted with ``terms``: bias and scale factor; (k,) deg/s that the terms bring into the measured rate at the
         samples; (k,) deg that they bring into the encoder's angle."""
-        k, gram = len(self.covariates.time_s) if terms else 1, self.gram(terms)
-        names = [name for t in terms for name in t.names]
-        fixed = [i for i, name in enumerate(names, 1 + gram.base) if not name]
-        free = [i for i, name in enumerate(names, 1 + gram.base) if name]
-        found = gram.known(dict.fromkeys(fixed, 1.0)).coefficients(free)[0]
-        sizes = np.ones(len(names))
+        k, (gram, free) = len(self.covariates.time_s) if terms else 1, self.free(terms)
+        found = gram.coefficients(free)[0]
+        sizes = np.ones(sum(len(t.names) for t in terms))
         sizes[[i - 1 - gram.base for i in free]] = found[gram.base :]
         base = self.values + found[: len(self.values)]
         rate, angle = np.zeros(k), np.zeros(k)
@@ -402,6 +399,14 @@ class Space:
         order = [k if k >= 0 else len(inside) - 1 - k for k in order]
         parts = bank.parts_with(inside, own, folds=folds)
         return Gram(parts[:, order][:, :, order], self.prior)
+
+    def free(self, terms: Sequence[Term], *, folds: bool = False) -> tuple[Gram, list[int]]:
+        """The terms' Gram matrix, and which of its columns have a coefficient that is not known to be one."""
+        gram = self.gram(terms, folds=folds)
+        named = [name for t in terms for name in t.names]
+        fixed = [k for k, name in enumerate(named, 1 + gram.base) if not name]
+        free = [k for k, name in enumerate(named, 1 + gram.base) if name]
+        return (gram.known(dict.fromkeys(fixed, 1.0)) if fixed else gram), free
 
     def unrest(self, term: Term, held: F64, left: F64) -> float:
         """How much more the evidence for ``term`` scatters from block to block than the noise model has it, 1 or more.
